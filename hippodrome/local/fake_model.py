@@ -102,8 +102,8 @@ class _Handler(BaseHTTPRequestHandler):
     def answer(self, path: str, request: dict[str, Any]) -> None:
         """Answer a request that is not refused."""
         if path == "/embeddings":
-            given = request.get("input")
-            texts = given if isinstance(given, list) else [given]
+            input_given = request.get("input")
+            texts = input_given if isinstance(input_given, list) else [input_given]
             vectors = [[byte / 255 for byte in hashlib.sha256(str(text).encode()).digest()[:8]] for text in texts]
             data = [{"object": "embedding", "index": n, "embedding": vector} for n, vector in enumerate(vectors)]
             usage = {"prompt_tokens": len(texts), "total_tokens": len(texts)}
@@ -154,8 +154,8 @@ def _usage(used: tuple[int, int]) -> dict[str, int]:
     return {"prompt_tokens": used[0], "completion_tokens": used[1], "total_tokens": sum(used)}
 
 
-def _chat(request: Mapping[str, Any], said: str, used: tuple[int, int]) -> dict[str, Any]:
-    message = {"role": "assistant", "content": said}
+def _chat(request: Mapping[str, Any], text: str, used: tuple[int, int]) -> dict[str, Any]:
+    message = {"role": "assistant", "content": text}
     return {
         "id": "fake",
         "object": "chat.completion",
@@ -166,9 +166,9 @@ def _chat(request: Mapping[str, Any], said: str, used: tuple[int, int]) -> dict[
     }
 
 
-def _chat_events(request: Mapping[str, Any], said: str, used: tuple[int, int]) -> Iterator[str]:
+def _chat_events(request: Mapping[str, Any], text: str, used: tuple[int, int]) -> Iterator[str]:
     chunk = {"id": "fake", "object": "chat.completion.chunk", "created": 0, "model": request.get("model")}
-    for piece in re.findall(r"\s*\S+", said):
+    for piece in re.findall(r"\s*\S+", text):
         choice = {"index": 0, "delta": {"content": piece}, "finish_reason": None}
         yield f"data: {json.dumps({**chunk, 'choices': [choice]})}"
     yield f"data: {json.dumps({**chunk, 'choices': [{'index': 0, 'delta': {}, 'finish_reason': 'stop'}]})}"
@@ -177,8 +177,8 @@ def _chat_events(request: Mapping[str, Any], said: str, used: tuple[int, int]) -
     yield "data: [DONE]"
 
 
-def _response(request: Mapping[str, Any], said: str, used: tuple[int, int]) -> dict[str, Any]:
-    content = [{"type": "output_text", "text": said, "annotations": []}]
+def _response(request: Mapping[str, Any], text: str, used: tuple[int, int]) -> dict[str, Any]:
+    content = [{"type": "output_text", "text": text, "annotations": []}]
     message = {"id": "fake", "type": "message", "role": "assistant", "status": "completed", "content": content}
     return {
         "id": "fake",
@@ -200,12 +200,12 @@ def _response(request: Mapping[str, Any], said: str, used: tuple[int, int]) -> d
     }
 
 
-def _response_events(request: Mapping[str, Any], said: str, used: tuple[int, int]) -> Iterator[str]:
+def _response_events(request: Mapping[str, Any], text: str, used: tuple[int, int]) -> Iterator[str]:
     number = 0
-    for number, piece in enumerate(re.findall(r"\s*\S+", said)):
+    for number, piece in enumerate(re.findall(r"\s*\S+", text)):
         place = {"item_id": "fake", "output_index": 0, "content_index": 0, "sequence_number": number}
         yield _named("response.output_text.delta", {"delta": piece, "logprobs": [], **place})
-    yield _named("response.completed", {"response": _response(request, said, used), "sequence_number": number + 1})
+    yield _named("response.completed", {"response": _response(request, text, used), "sequence_number": number + 1})
 
 
 def _named(kind: str, data: Mapping[str, Any]) -> str:

@@ -14,5 +14,7 @@ _OWNER = (*environment.PARTICIPANT, environment.SESSION)
 
 def inherited_environment() -> dict[str, str]:
     """Return this process's variables without AWS's and those of a server's owner, so that servers find Hippodrome."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(_AWS) and name not in _OWNER}
-    return places.for_child(kept)
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith(_AWS) and name not in _OWNER
+    }
+    return places.for_child(environment)

@@ -186,16 +186,16 @@ def command(
     ] = "",
 ) -> None:
     """Copy the study TEMPLATE to the folder STUDY, give it an id of its own, and say what to do next."""
-    known = templates()
+    available = templates()
     if not template and not folder:
         screen.result(
-            f"Name a folder and a template: hippodrome new {_FOLDER} {next(iter(known), '')}\n{listing(known)}"
+            f"Name a folder and a template: hippodrome new {_FOLDER} {next(iter(available), '')}\n{listing(available)}"
         )
         return
-    if template not in known:
+    if template not in available:
         raise Problem(
             f"There is no template {template}." if template else "No template is named.",
-            listing(known),
+            listing(available),
             exit_code=Exit.MISUSE,
         )
     if folder in ("", "."):
@@ -204,5 +204,5 @@ def command(
             f"Name one: hippodrome new {_FOLDER} {template}",
             exit_code=Exit.MISUSE,
         )
-    project_id = make_study(known[template], Path(folder))
+    project_id = make_study(available[template], Path(folder))
     screen.result(f"Made {folder} from {template}; its project id is {project_id}.\n{what_next(Path(folder))}")

@@ -19,12 +19,12 @@ def user_ids(
     With `group` all ids belong to one group. With `mixed` each belongs to the next group, and after the last group
     comes the first again. `new` makes an id from a number. If `MAX_TRIED` ids do not suffice, the result is shorter.
     """
-    made = (new(number) for number in itertools.count(1))
+    new_ids = (new(number) for number in itertools.count(1))
     if not groups or matching not in ("group", "mixed"):
-        return list(itertools.islice(made, players))
+        return list(itertools.islice(new_ids, players))
     user_ids: list[str] = []
     first: int | None = None
-    for user_id in itertools.islice(made, MAX_TRIED):
+    for user_id in itertools.islice(new_ids, MAX_TRIED):
         group = ids.group(project_id, user_id, groups)
         first = group if first is None else first
         step = len(user_ids) if matching == "mixed" else 0

@@ -64,9 +64,9 @@ def publish(
 
 def _changed(documents: Documents, config: Config) -> str:
     """The steps whose page is another one now, in words; empty if there are none, or if no participant has begun."""
-    found = documents.get(MASTER_LIST)
+    document = documents.get(MASTER_LIST)
     try:
-        before = read_list(found.body).find(config.project.id) if found else None
+        before = read_list(document.body).find(config.project.id) if document else None
     except ValueError:  # the registration below reports a list that cannot be read
         return ""
     if before is None:
@@ -81,19 +81,19 @@ def _changed(documents: Documents, config: Config) -> str:
 def step_files(folder: Path) -> list[Path]:
     """Return the files in the folder of pages, sorted: pages, pictures and the like, without hidden files."""
     pages = layout.pages_folder(folder)
-    found = pages.iterdir() if pages else ()
-    return sorted(file for file in found if file.is_file() and not file.name.startswith("."))
+    page_paths = pages.iterdir() if pages else ()
+    return sorted(file for file in page_paths if file.is_file() and not file.name.startswith("."))
 
 
 def _put(documents: Documents, key: str, body: bytes) -> None:
     """Write the document, unless it has this content already."""
     while True:
-        found = documents.get(key)
-        if found and found.body == body:
+        document = documents.get(key)
+        if document and document.body == body:
             return
         try:
-            if found:
-                documents.replace(key, body, found.etag)
+            if document:
+                documents.replace(key, body, document.etag)
             else:
                 documents.create(key, body)
         except Conflict:

@@ -28,10 +28,10 @@ def wanted(folder: Path) -> Path | None:
     The clone's file names versions for Python 3.7, which cannot be installed (docs/hippo.md).
     """
     try:
-        found = layout.find(folder)
+        agent_folder = layout.find(folder)
     except ConfigErrors:
         return None  # the command that runs next reports the mistake
-    return None if found.requirements is None or found.of_hippo else found.requirements
+    return None if agent_folder.requirements is None or agent_folder.of_hippo else agent_folder.requirements
 
 
 def stamp_of(file: Path, constraints: Path, stamps: Path) -> Path:

@@ -61,15 +61,15 @@ class Watch:
         last = self._known
         while not self._closed.wait(LOOK):
             try:
-                seen = self._look()
+                file_times = self._look()
             except OSError:  # a file that cannot be seen now is not gone
                 continue
-            if seen == last != self._known:  # the change is complete
-                before, self._known = self._known, seen
-                self._changed(sorted({name for name, _ in before.items() ^ seen.items()}))
+            if file_times == last != self._known:  # the change is complete
+                before, self._known = self._known, file_times
+                self._changed(sorted({name for name, _ in before.items() ^ file_times.items()}))
             elif self._refused:
                 self._publish()
-            last = seen
+            last = file_times
 
     def _changed(self, changed: list[str]) -> None:
         for name in changed:
@@ -119,7 +119,7 @@ class Watch:
 
     def _look(self) -> Seen:
         """By file of the project: when it changed last (ns), and its size. Raises OSError if that cannot be seen."""
-        seen = {}
+        file_times = {}
         files = [self._folder / name for name in layout.config_names()]
         with contextlib.suppress(*_GONE):
             files += step_files(self._folder)
@@ -129,8 +129,8 @@ class Watch:
         for file in files:
             with contextlib.suppress(*_GONE):
                 status = os.stat(file)
-                seen[file.relative_to(self._folder).as_posix()] = (status.st_mtime_ns, status.st_size)
-        return seen
+                file_times[file.relative_to(self._folder).as_posix()] = (status.st_mtime_ns, status.st_size)
+        return file_times
 
 
 def _mistaken(problems: Iterable[Diagnostic]) -> bool:

@@ -44,12 +44,12 @@ class Handover:
 def parse(body: bytes) -> Handover:
     """Read the bytes of a handover document. Raises BadHandover and no other exception."""
     try:
-        found = json.loads(body)
+        parsed = json.loads(body)
     except (ValueError, RecursionError) as error:
         raise BadHandover("its document is not JSON") from error
-    if not isinstance(found, dict) or found.get("schema", SCHEMA) != SCHEMA:
+    if not isinstance(parsed, dict) or parsed.get("schema", SCHEMA) != SCHEMA:
         raise BadHandover("its document has a schema that this server cannot read")
-    user_id, group, server = found.get("userId"), found.get("group"), found.get("server")
+    user_id, group, server = parsed.get("userId"), parsed.get("group"), parsed.get("server")
     if not (isinstance(user_id, str) and (NAME.fullmatch(user_id) or is_session_id(user_id))):
         raise BadHandover("its document names no participant")
     if not (isinstance(server, str) and SERVER_NAME.fullmatch(server)):

@@ -25,18 +25,18 @@ def actions_of_keys(value: dict[str, Any], path: KeyPath) -> tuple[dict[str, Any
 
     Returns the valid entries, and the problems.
     """
-    if not value or not all(isinstance(each, dict) for each in value.values()):
+    if not value or not all(isinstance(key_map, dict) for key_map in value.values()):
         return _one_players_keys(value, path)
-    found: dict[str, Any] = {}
+    by_player: dict[str, Any] = {}
     problems: list[SectionProblem] = []
     for player, keys in value.items():
-        found[str(player)], wrong = _one_players_keys(keys, (*path, player))
+        by_player[str(player)], wrong = _one_players_keys(keys, (*path, player))
         problems += wrong
-    return found, problems
+    return by_player, problems
 
 
 def _one_players_keys(value: dict[str, Any], path: KeyPath) -> tuple[dict[str, str], list[SectionProblem]]:
-    found: dict[str, str] = {}
+    by_key: dict[str, str] = {}
     problems: list[SectionProblem] = []
     names: dict[frozenset[str], str] = {}  # by combination: the same one can be written in several ways
     for name, action in value.items():
@@ -49,8 +49,8 @@ def _one_players_keys(value: dict[str, Any], path: KeyPath) -> tuple[dict[str, s
         first = names.setdefault(frozenset(keyboard.parts(key)), name)
         if first != name:
             problems.append(SectionProblem(here, f"is the same as {keyboard.shown(first)}; keep one of them"))
-        found[key] = action_name
-    return found, problems + too_many(value, path, MAX_KEYS)
+        by_key[key] = action_name
+    return by_key, problems + too_many(value, path, MAX_KEYS)
 
 
 labels = map_of(_action, values.text("the text of a button", MAX_NAME), MAX_KEYS)

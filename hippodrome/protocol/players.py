@@ -132,12 +132,12 @@ def idle_action(value: object) -> str | dict[str, str]:
     return values.action_name(value)
 
 
-def files(named: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
+def files(policies: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
     """Yield the policies' files in this map and the maps in it, each after its path of keys.
 
     The map need not have been checked: values that are no name of a file are left out.
     """
-    for key, plays in named.items():
+    for key, plays in policies.items():
         if isinstance(plays, Mapping):
             yield from (((key, *path), file) for path, file in files(plays))
         elif isinstance(plays, str) and plays.endswith(".onnx"):

@@ -37,8 +37,10 @@ class Section:
         """Return the section as if the file did not have the keys of these names."""
         defaults = type(self)()
         left_out = [key.attribute for key in keys(type(self)) if key.name in names]
-        given = frozenset(self.given_keys.difference(names))
-        return dataclasses.replace(self, given_keys=given, **{each: getattr(defaults, each) for each in left_out})
+        keys_given = frozenset(self.given_keys.difference(names))
+        return dataclasses.replace(
+            self, given_keys=keys_given, **{attribute: getattr(defaults, attribute) for attribute in left_out}
+        )
 
 
 _Declared = TypeVar("_Declared", bound=Section)
@@ -115,7 +117,7 @@ def text(default: str | None, meaning: str, check: Check | None = None, **more: 
 def items(
     item: str,
     limit: int,
-    each: Check,
+    check: Check,
     default: tuple[str, ...],
     meaning: str,
     *,
@@ -124,7 +126,7 @@ def items(
 ) -> Any:
     """Declare a key that is a list of at most `limit` texts; with `single`, one of them may stand there by itself."""
     schema = {"items": {"type": "string"}, "type": ["array", "string"] if single else "array"}
-    return key(values.items(item, limit, single), default, meaning, schema, each=each, **more)
+    return key(values.items(item, limit, single), default, meaning, schema, each=check, **more)
 
 
 def section(kind: type[Section], default: Section | None, meaning: str, line: str = "", **more: Any) -> Any:
@@ -150,9 +152,9 @@ def map_of(name: Check, value: Check, limit: int | None = None) -> Entries:
     def entries(section: Mapping[Any, Any], path: KeyPath) -> tuple[dict[Any, Any], list[SectionProblem]]:
         found: dict[Any, Any] = {}
         problems: list[SectionProblem] = []
-        for given, item in section.items():
-            checked_name, wrong = checked(name, given, (*path, given))
-            checked_value, wrong_value = checked(value, item, (*path, given))
+        for key, item in section.items():
+            checked_name, wrong = checked(name, key, (*path, key))
+            checked_value, wrong_value = checked(value, item, (*path, key))
             problems += wrong + wrong_value
             if not wrong and not wrong_value:
                 found[checked_name] = checked_value
@@ -169,34 +171,34 @@ def too_many(section: Mapping[Any, Any], path: KeyPath, limit: int) -> list[Sect
 
 
 def check_section(
-    kind: type[_Declared], given: Mapping[str, Any], path: KeyPath = ()
+    kind: type[_Declared], written: Mapping[str, Any], path: KeyPath = ()
 ) -> tuple[_Declared, list[SectionProblem]]:
     """Return the values of a section, and all its problems. `path` is the path of the section. Never raises.
 
     `given` holds JSON values, or texts and `values.Plain`. Of a wrong value the valid part stays, if it is a section or
     a map, else the default takes its place. Problems with keys that are not declared have the sentence `UNKNOWN_KEY`.
     """
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     valid: set[str] = set()
     problems: list[SectionProblem] = []
     for key in keys(kind):
-        value = given.get(key.name)
+        value = written.get(key.name)
         # An empty map leaves a section as it is by default.
         if is_blank(value) or (value == {} and isinstance(key.default, Section)):
             continue
         value, wrong = _value(key, value, (*path, key.name))
         problems += wrong
         if value is not None:
-            found[key.attribute] = value
+            values[key.attribute] = value
             valid.add(key.name)
-    unknown = {name: value for name, value in given.items() if name not in names(kind)}
+    unknown = {name: value for name, value in written.items() if name not in names(kind)}
     declared = others_of(kind)
     if declared is None:
         problems += [SectionProblem((*path, name), UNKNOWN_KEY) for name in unknown]
     else:
-        found[declared.name], wrong = declared.metadata["others"](unknown, path)
+        values[declared.name], wrong = declared.metadata["others"](unknown, path)
         problems += wrong
-    return kind(given_keys=frozenset(valid), **found), problems
+    return kind(given_keys=frozenset(valid), **values), problems
 
 
 def _value(key: Key, value: Any, path: KeyPath) -> tuple[Any, list[SectionProblem]]:
@@ -215,8 +217,8 @@ def _value(key: Key, value: Any, path: KeyPath) -> tuple[Any, list[SectionProble
 
 def document(section: Section) -> dict[str, Any]:
     """Return a section as JSON, with every default filled in, and with the project's own controls if it is `ui`."""
-    found = {key.name: _json(getattr(section, key.attribute)) for key in keys(type(section))}
-    return found | dict.fromkeys(getattr(section, "own", ()), True)
+    values = {key.name: _json(getattr(section, key.attribute)) for key in keys(type(section))}
+    return values | dict.fromkeys(getattr(section, "own", ()), True)
 
 
 def _json(value: Any) -> Any:

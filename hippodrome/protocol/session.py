@@ -100,22 +100,22 @@ def member_token(token: str, user_id: str) -> str:
 def parse(body: bytes) -> SessionDocument:
     """Read the bytes of a session's document. Raises BadSession and no other exception."""
     try:
-        found = json.loads(body)
+        parsed = json.loads(body)
     except (ValueError, RecursionError) as error:
         raise BadSession("its document is not JSON") from error
-    if not isinstance(found, dict) or found.get("schema", SCHEMA) != SCHEMA:
+    if not isinstance(parsed, dict) or parsed.get("schema", SCHEMA) != SCHEMA:
         raise BadSession("its document has a schema that this version cannot read")
-    players, members = found.get("players"), found.get("members")
-    if not is_session_id(found.get("id")):
+    players, members = parsed.get("players"), parsed.get("members")
+    if not is_session_id(parsed.get("id")):
         raise BadSession("its document names no session")
     if not (_is_number(players) and 1 <= players <= MAX_PLAYERS and isinstance(members, list)):
         raise BadSession("its document does not say who plays")
-    formed = found.get("formed", "")
+    formed = parsed.get("formed", "")
     session = SessionDocument(
-        found["id"],
+        parsed["id"],
         players,
         tuple(_member(member) for member in members),
-        _group(found.get("group")),
+        _group(parsed.get("group")),
         formed if isinstance(formed, str) else "",
     )
     seats = [member.seat for member in session.members]
@@ -125,15 +125,15 @@ def parse(body: bytes) -> SessionDocument:
     return session
 
 
-def _member(found: Any) -> Member:
-    if not isinstance(found, dict):
+def _member(written: Any) -> Member:
+    if not isinstance(written, dict):
         raise BadSession("its document has a member that is no object")
-    user_id, seat = found.get("userId"), found.get("seat")
+    user_id, seat = written.get("userId"), written.get("seat")
     if not isinstance(user_id, str) or (user_id and not NAME.fullmatch(user_id)):
         raise BadSession("its document has a member without an id")
     if not (_is_number(seat) and seat >= 0):
         raise BadSession("its document has a member without a seat")
-    return Member(user_id, _group(found.get("group")), seat)
+    return Member(user_id, _group(written.get("group")), seat)
 
 
 def _group(value: Any) -> int | None:

@@ -462,8 +462,8 @@ class TrialSection(Section):
     @property
     def pages(self) -> Mapping[str, str]:
         """The pages that the game page shows: key of config.yml → name of the file in the folder of pages."""
-        named = {"instructions": self.instructions, "betweenEpisodes": self.between_episodes}
-        return {key: page for key, page in named.items() if isinstance(page, str)}
+        page_names = {"instructions": self.instructions, "betweenEpisodes": self.between_episodes}
+        return {key: page for key, page in page_names.items() if isinstance(page, str)}
 
     def keys_of(self, player: str) -> Mapping[str, str]:
         """Return the actions of a player's keys by combination (`protocol.keyboard`); {} for the default keys."""
@@ -481,12 +481,12 @@ class TrialSection(Section):
     @property
     def keys_differ(self) -> bool:
         """Whether `keys` has a map for each player."""
-        return any(isinstance(each, dict) for each in self.keys.values())
+        return any(isinstance(action, dict) for action in self.keys.values())
 
     def key_maps(self) -> Iterator[tuple[KeyPath, Mapping[str, str]]]:
         """Yield `keys`, or the map in it for each player, after its path below `keys`."""
         if self.keys_differ:
-            yield from (((player,), each) for player, each in self.keys.items())
+            yield from (((player,), key_map) for player, key_map in self.keys.items())
         else:
             yield (), self.keys
 
@@ -534,7 +534,7 @@ class TrialSection(Section):
         """Return the section as a registration stores it: as `document`, without SESSION_KEYS, `chat` and `llm` if they
         have their default values, since ECS limits the length of a server's variables."""
         defaults, left_out = TrialSection().document(), (*SESSION_KEYS, "chat", "llm")
-        return {key: each for key, each in self.document().items() if key not in left_out or each != defaults[key]}
+        return {key: value for key, value in self.document().items() if key not in left_out or value != defaults[key]}
 
 
 SESSION_KEYS = tuple(key.name for key in keyed.keys(TrialSection) if key.together)

@@ -23,19 +23,19 @@ _PROMPT_FILES = (".txt", ".md")
 
 def _url(value: object) -> str:
     """Return the address without a slash at its end. Raises ValueError with what to write."""
-    found = values.as_text(value, "the address of the model's API, such as https://example.org/v1").rstrip("/")
+    url = values.as_text(value, "the address of the model's API, such as https://example.org/v1").rstrip("/")
     try:
-        parts = urlsplit(found)
+        parts = urlsplit(url)
         host, _ = parts.hostname, parts.port  # `port` raises ValueError if it is no number
     except ValueError:
         raise ValueError(f"must be an address such as https://example.org/v1, not {values.show(value)}") from None
-    if not host or parts.scheme not in ("https", "http") or parts.query or parts.fragment or " " in found:
+    if not host or parts.scheme not in ("https", "http") or parts.query or parts.fragment or " " in url:
         raise ValueError(f"must be an address such as https://example.org/v1, not {values.show(value)}")
     if parts.username or parts.password:
         raise ValueError("must be without a name or a password; the key belongs into the variable LLM_KEY")
     if parts.scheme == "http" and host not in LOOPBACK:
         raise ValueError("must begin with https://, so that nobody on the way reads the key and what people say")
-    return found
+    return url
 
 
 def is_loopback(url: str) -> bool:

@@ -48,9 +48,11 @@ def _actions_that_exist(trial: TrialSection) -> Iterator[SectionProblem]:
     names = [action.lower() for action in trial.action_space]
     if not names:
         return
-    named = [("keys", (*place, key), action) for place, each in trial.key_maps() for key, action in each.items()]
-    named += [("labels", (action,), action) for action in trial.labels]
-    for section, path, action in named:
+    actions_named = [
+        ("keys", (*place, key), action) for place, key_map in trial.key_maps() for key, action in key_map.items()
+    ]
+    actions_named += [("labels", (action,), action) for action in trial.labels]
+    for section, path, action in actions_named:
         if action in names:
             continue
         hint = did_you_mean(action, names) or f"; the actions are {values.printable(', '.join(names), 100)}"
@@ -60,12 +62,14 @@ def _actions_that_exist(trial: TrialSection) -> Iterator[SectionProblem]:
 
 def _players_that_exist(trial: TrialSection) -> Iterator[SectionProblem]:
     """`keys` by player and `playerNames` name only players of `players`, if the file has it."""
-    known = trial.named_players()
-    named = [("keys", player) for player, keys in trial.keys.items() if isinstance(keys, dict)]
-    named += [("playerNames", player) for player in trial.player_names]
-    for section, player in named:
-        if known and player not in known:
-            sentence = f"there is no such player in players; there are {values.printable(', '.join(known), 100)}"
+    players_known = trial.named_players()
+    players_named = [("keys", player) for player, keys in trial.keys.items() if isinstance(keys, dict)]
+    players_named += [("playerNames", player) for player in trial.player_names]
+    for section, player in players_named:
+        if players_known and player not in players_known:
+            sentence = (
+                f"there is no such player in players; there are {values.printable(', '.join(players_known), 100)}"
+            )
             yield SectionProblem((section, player), sentence, ("players", section))
 
 

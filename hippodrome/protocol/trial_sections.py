@@ -20,7 +20,7 @@ _CONTROL = values.text("the name of a control", MAX_NAME)
 
 def _own_controls(others: dict[str, Any], path: KeyPath) -> tuple[tuple[str, ...], list[SectionProblem]]:
     """The names of the project's own controls in `ui` that are to be shown, in the order of the file."""
-    found: list[str] = []
+    controls: list[str] = []
     problems: list[SectionProblem] = []
     for name, value in others.items():
         here = (*path, name)
@@ -30,12 +30,12 @@ def _own_controls(others: dict[str, Any], path: KeyPath) -> tuple[tuple[str, ...
         elif shown:
             _, wrong = checked(_CONTROL, name, here)
         if shown and not wrong:
-            found.append(name)
+            controls.append(name)
         problems += wrong
-    if len(found) > MAX_OWN_CONTROLS:
-        sentence = f"must have at most {MAX_OWN_CONTROLS} controls of your own, not {len(found)}"
+    if len(controls) > MAX_OWN_CONTROLS:
+        sentence = f"must have at most {MAX_OWN_CONTROLS} controls of your own, not {len(controls)}"
         problems.insert(0, SectionProblem(path, sentence))
-    return tuple(found), problems
+    return tuple(controls), problems
 
 
 def _control() -> Any:
@@ -87,18 +87,18 @@ _FOLDER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(?:/[A-Za-z0-9_][A-Za-z0-9._-]
 
 def _color(value: object) -> str:
     """Check a color of the form `#rrggbb`, and return it in small letters."""
-    found = values.as_text(value, 'a color such as "#ffffff", in quotes')
-    if not _COLOR.fullmatch(found):
+    color = values.as_text(value, 'a color such as "#ffffff", in quotes')
+    if not _COLOR.fullmatch(color):
         raise ValueError(f'must be a color such as "#ffffff", in quotes, not {values.show(value)}')
-    return found.lower()
+    return color.lower()
 
 
 def _folder(value: object) -> str:
     """Check the name of a folder in the project's folder."""
-    found = values.as_text(value, "a folder of the project").rstrip("/").removeprefix("./")
-    if len(found) > 200 or not _FOLDER.fullmatch(found):
+    folder = values.as_text(value, "a folder of the project").rstrip("/").removeprefix("./")
+    if len(folder) > 200 or not _FOLDER.fullmatch(folder):
         raise ValueError(f"must be a folder of the project, such as assets, not {values.show(value)}")
-    return found
+    return folder
 
 
 def _pixels(default: int, meaning: str) -> Any:

@@ -105,10 +105,10 @@ def text(expected: str = "text", limit: int = 500) -> Check:
     """Return a check for a text of up to `limit` characters; `expected` names it in messages."""
 
     def check(value: object) -> str:
-        found = as_text(value, expected)
-        if len(found) > limit:
-            raise ValueError(f"must be at most {limit} characters long, not {len(found)}")
-        return found
+        text = as_text(value, expected)
+        if len(text) > limit:
+            raise ValueError(f"must be at most {limit} characters long, not {len(text)}")
+        return text
 
     return check
 
@@ -230,11 +230,11 @@ def options(value: object) -> dict[str, object]:
     """
     if not isinstance(value, dict):
         raise ValueError(f'must be a map: indented lines such as "difficulty: 3" below it, not {show(value)}')
-    found = _json_map(value, _OPTIONS_DEPTH)
-    length = len(json.dumps(found, separators=(",", ":")))
+    options_read = _json_map(value, _OPTIONS_DEPTH)
+    length = len(json.dumps(options_read, separators=(",", ":")))
     if length > _OPTIONS_LENGTH:
         raise ValueError(f"must be at most {_OPTIONS_LENGTH} characters long when written as JSON, not {length}")
-    return found
+    return options_read
 
 
 def _json_map(value: dict[object, object], depth: int) -> dict[str, object]:

@@ -163,7 +163,7 @@ class ActivityLog:
             if session_id in self._shown:
                 return
             self._shown.add(session_id)
-        members = sorted(record.get("members", ()), key=lambda each: each.get("seat", 0))
+        members = sorted(record.get("members", ()), key=lambda member: member.get("seat", 0))
         names = ", ".join(_short(str(member.get("userId"))) for member in members)
         lacking = int(record.get("players", 0)) - len(members)
         rest = f"; a policy plays in {lacking} place{'s' if lacking > 1 else ''}" if lacking > 0 else ""
@@ -303,7 +303,7 @@ def _short(user_id: str) -> str:
 
 def _json(body: bytes) -> dict[str, Any]:
     try:
-        found = json.loads(body)
+        parsed = json.loads(body)
     except ValueError:
         return {}
-    return found if isinstance(found, dict) else {}
+    return parsed if isinstance(parsed, dict) else {}

@@ -85,9 +85,12 @@ class WatchedServer:
     def _find_members(self) -> None:
         """Look whether the session has been formed. Answers of its members that exist by then are not of its game."""
         with contextlib.suppress(OSError, BadSession):
-            found = session.parse((self._data / self.folder / "session.json").read_bytes())
-            project, ids = self.folder.partition("/")[0], [member.user_id for member in found.members if member.user_id]
-            self._folders = tuple(participant_folder(project, each).rstrip("/") for each in ids)
+            session_read = session.parse((self._data / self.folder / "session.json").read_bytes())
+            project, ids = (
+                self.folder.partition("/")[0],
+                [member.user_id for member in session_read.members if member.user_id],
+            )
+            self._folders = tuple(participant_folder(project, user_id).rstrip("/") for user_id in ids)
             self._known = self._keys()
 
 
@@ -125,8 +128,8 @@ def _begins_anew(raw: bytes) -> str:
     """What to show if the line says that a lost server's game could not be resumed where it was; otherwise ""."""
     if b" WARNING the episode cannot go on where it was" not in raw:
         return ""
-    left = "something in agent.py is left to chance" if b"(Diverged)" in raw else "agent.py failed at that"
-    return f"the lost server's game could not be played again, and begins anew: {left} (docs/agent.md)"
+    cause = "something in agent.py is left to chance" if b"(Diverged)" in raw else "agent.py failed at that"
+    return f"the lost server's game could not be played again, and begins anew: {cause} (docs/agent.md)"
 
 
 def last_error(log: Path) -> str:
@@ -134,10 +137,10 @@ def last_error(log: Path) -> str:
     reader = ErrorReader(log)
     try:
         with log.open("rb") as lines:
-            found = [text for text in map(reader.read, lines) if text]
+            errors = [text for text in map(reader.read, lines) if text]
     except OSError:
         return ""
-    return found[-1].strip() if found else ""
+    return errors[-1].strip() if errors else ""
 
 
 def _size(path: Path) -> int:

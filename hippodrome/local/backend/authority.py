@@ -41,8 +41,8 @@ class Authority:
         self._key_file = folder / "authority.key"
         self._folder = folder
         self._host = host
-        found = self._load()
-        self._own, self._key = found if found is not None else self._make()
+        loaded = self._load()
+        self._own, self._key = loaded if loaded is not None else self._make()
 
     def context(self, *names: str) -> ssl.SSLContext:
         """Return a TLS context for a server, with a new certificate for these names and addresses."""
@@ -87,9 +87,9 @@ class Authority:
         name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, _COMMON_NAME)])
         here = [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_network("127.0.0.0/8"))]
         if self._host is not None:
-            named = general_name(self._host)
-            is_name = isinstance(named, x509.DNSName)
-            here.append(named if is_name else x509.IPAddress(ipaddress.ip_network(self._host)))
+            host_name = general_name(self._host)
+            is_name = isinstance(host_name, x509.DNSName)
+            here.append(host_name if is_name else x509.IPAddress(ipaddress.ip_network(self._host)))
         own = (
             _builder(name, AUTHORITY_DAYS)
             .issuer_name(name)

@@ -117,10 +117,10 @@ class _Queue:
     def take_all(self) -> list[Any]:
         """Remove all messages, and return them in the order in which they are due."""
         with self._changed:
-            taken, self._waiting = sorted(self._waiting), []
-        for queued in taken:
+            messages, self._waiting = sorted(self._waiting), []
+        for queued in messages:
             (self._folder / queued.file).unlink(missing_ok=True)
-        return [json.loads(queued.body) for queued in taken]
+        return [json.loads(queued.body) for queued in messages]
 
     def stop(self, until: float) -> None:
         """Deliver nothing more; wait for running handlers, at most until `until` (monotonic)."""

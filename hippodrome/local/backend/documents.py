@@ -180,14 +180,14 @@ def _walk(folder: Path, prefix: str, start: str) -> Iterator[Entry]:
     A folder sorts as if its name ended with a slash.
     """
     try:
-        found = [
+        entries = [
             (os.fsencode(entry.name + "/" if entry.is_dir() else entry.name), entry)
             for entry in os.scandir(folder)
             if entry.name.startswith(start) and not entry.name.startswith(".")
         ]
     except (FileNotFoundError, NotADirectoryError):
         return
-    for name, entry in sorted(found, key=lambda pair: pair[0]):
+    for name, entry in sorted(entries, key=lambda pair: pair[0]):
         if name.endswith(b"/"):
             yield from _walk(Path(entry.path), f"{prefix}{entry.name}/", "")
             continue

@@ -147,13 +147,13 @@ class LocalPlatform:
         self.documents.tidy()
         for unfinished in [*self._state.glob(".*.new"), *(f for d in _OURS for f in (self._state / d).rglob(".*.new"))]:
             disk.remove_if_possible(unfinished)
-        kept = {key: self.documents.get(key) for key in _KEPT}
+        documents_before = {key: self.documents.get(key) for key in _KEPT}
         steps: list[Callable[[], object]] = [
             self.tasks.start,
             self.bus.start,
             self.timers.start,
             partial(start_thread, self._sweep, name="sweep"),
-            partial(start_thread, self._look_after, kept, name="guard"),
+            partial(start_thread, self._look_after, documents_before, name="guard"),
         ]
         for step in steps:
             self.retry.run(step, seconds=START_RETRY_SECONDS)
@@ -169,48 +169,53 @@ class LocalPlatform:
 
     # The data folder, which the researcher may delete while the study runs
 
-    def _look_after(self, kept: dict[str, Document | None]) -> None:
+    def _look_after(self, documents_before: dict[str, Document | None]) -> None:
         """Look whether the registration, the pages or the records were deleted; if so, publish the study again.
 
         `kept` are the documents of `_KEPT`, as they were at the start.
         """
-        known, last, warned = frozenset[str](), frozenset[str](), False
+        previous, last, warned = frozenset[str](), frozenset[str](), False
         while not self._closed.wait(LOOK):
             try:
-                kept = {key: self.documents.get(key, before) or before for key, before in kept.items()}
-                seen = self._existing()
+                documents_before = {
+                    key: self.documents.get(key, before) or before for key, before in documents_before.items()
+                }
+                existing = self._existing()
             except OSError as error:  # what exists is not known, so nothing counts as deleted
                 self.retry.report(error)
                 continue
-            deleted = known - seen
-            if deleted and seen == last:  # the deletion is complete
+            deleted = previous - existing
+            if deleted and existing == last:  # the deletion is complete
                 if not warned:
                     self._say(
                         f"THE DATA FOLDER {self.documents.folder} WAS DELETED, or files in it that the study needs."
                     )
                 try:
-                    self._begin_again(kept, servers="_servers" in deleted)
-                    known, warned = self._existing(), False
+                    self._begin_again(documents_before, servers="_servers" in deleted)
+                    previous, warned = self._existing(), False
                 except Exception as error:  # noqa: BLE001 - the next look tries again
                     if not warned:
                         self._say(f"The study cannot be published again (yet): {_reason(error)}")
                     warned = True
             elif not deleted:
-                known = seen
-            last = seen
+                previous = existing
+            last = existing
 
     def _existing(self) -> frozenset[str]:
         """Those of the study's documents and folders in the data that exist. Raises OSError if that cannot be seen."""
         folder = self.documents.folder
         projects = files.names(folder) if files.exists(folder) else []
-        wanted = [*(f"{project}/steps" for project in projects), *_KEPT, "_servers"]
-        return frozenset(name for name in wanted if files.exists(folder / name))
+        names = [*(f"{project}/steps" for project in projects), *_KEPT, "_servers"]
+        return frozenset(name for name in names if files.exists(folder / name))
 
-    def _begin_again(self, kept: Mapping[str, Document | None], *, servers: bool) -> None:
+    def _begin_again(self, documents_before: Mapping[str, Document | None], *, servers: bool) -> None:
         """Publish the study again. `servers`: whether the servers' records were deleted; then the servers are ended."""
         self.documents.prepare()
         ended = self.tasks.forget() if servers else 0
-        for key, document in kept.items():  # written as they were, so that open pages and completion codes stay valid
+        for (
+            key,
+            document,
+        ) in documents_before.items():  # written as they were, so that open pages and completion codes stay valid
             if document:
                 with contextlib.suppress(Conflict):
                     self.documents.create(key, document.body)

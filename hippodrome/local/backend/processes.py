@@ -57,15 +57,15 @@ def mark_of(state: Path, name: str) -> str:
 
 def marked(state: Path) -> dict[str, list[psutil.Process]]:
     """Return the processes that carry the mark of this state folder, by the server's name."""
-    found: dict[str, list[psutil.Process]] = {}
+    by_mark: dict[str, list[psutil.Process]] = {}
     ours = mark_of(state, "") + "/"
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
             for word in process.cmdline():
                 name = word.removeprefix(ours)
                 if name != word and "/" not in name:
-                    found.setdefault(name, []).append(process)
-    return found
+                    by_mark.setdefault(name, []).append(process)
+    return by_mark
 
 
 def end_everything(state: Path) -> None:
@@ -94,8 +94,8 @@ def child_of(shell: int | None, mark: str) -> psutil.Process | None:
         children = psutil.Process(shell).children() if shell else []
     except psutil.Error:
         return None
-    found = (process_of(child.pid, mark) for child in children)
-    return next((process for process in found if process and not is_shell(process)), None)
+    candidates = (process_of(child.pid, mark) for child in children)
+    return next((process for process in candidates if process and not is_shell(process)), None)
 
 
 def is_shell(process: psutil.Process) -> bool:

@@ -170,9 +170,9 @@ class TaskProcess:
         with self._shared.lock, contextlib.suppress(FileNotFoundError, handover.BadHandover):
             task = self.task
             if task.handover_key and not task.folder and not self.forgotten.is_set():
-                found = handover.parse((self._shared.data / task.handover_key).read_bytes())
+                handover_read = handover.parse((self._shared.data / task.handover_key).read_bytes())
                 project = task.handover_key.partition("/")[0]
-                self._save(folder=folder_of(project, found.user_id), server=found.server)
+                self._save(folder=folder_of(project, handover_read.user_id), server=handover_read.server)
 
     @property
     def unfinished(self) -> Sequence[Path]:

@@ -84,15 +84,18 @@ class ProcessTasks:
 
     def run(self, request: TaskRequest) -> str:
         claim = claim_of(request)
-        known = self._servers.get(request.name)
-        if known and known.task.claim not in ("", claim):  # the record of that earlier server was deleted with the data
+        task_server = self._servers.get(request.name)
+        if task_server and task_server.task.claim not in (
+            "",
+            claim,
+        ):  # the record of that earlier server was deleted with the data
             self.forget([request.name])
         with self._lock:
             if self._closing:
                 raise RuntimeError("local mode is ending: no server is started any more")
-            known = self._servers.get(request.name)
-            if known:
-                return known.task.arn
+            task_server = self._servers.get(request.name)
+            if task_server:
+                return task_server.task.arn
             id_ = hashlib.sha256(f"{self._state}\0{request.name}\0{time.time_ns()}".encode()).hexdigest()[:32]
             task = TaskRecord.of(request, id_)
             server = TaskProcess(task, self._shared)
@@ -102,16 +105,16 @@ class ProcessTasks:
         return task.arn
 
     def stop(self, task: str, cluster: str, reason: str) -> None:
-        server = next((one for one in self._all() if one.task.arn == task), None)
+        server = next((candidate for candidate in self._all() if candidate.task.arn == task), None)
         if server:
             server.end(reason, time.monotonic() + self._shared.stop_timeout)
 
     def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
-        wanted = set(interfaces)
+        wanted_ids = set(interfaces)
         return {
             task.interface: Address(HOST, self._named_port or task.port)
             for task in (server.task for server in self._all() if server.lives)
-            if task.interface in wanted and task.port
+            if task.interface in wanted_ids and task.port
         }
 
     def port_of(self, label: str) -> int | None:
@@ -120,8 +123,10 @@ class ProcessTasks:
         The label is the server's name, or its participant's id in lower case.
         """
         listening = [server.task for server in self._all() if server.lives and server.task.port]
-        named = [task for task in listening if label in (task.name, task.folder.rstrip("/").rpartition("/")[2].lower())]
-        return max(named, key=lambda task: task.created).port if named else None
+        servers_named = [
+            task for task in listening if label in (task.name, task.folder.rstrip("/").rpartition("/")[2].lower())
+        ]
+        return max(servers_named, key=lambda task: task.created).port if servers_named else None
 
     def find(self, name: str, cluster: str) -> str | None:
         server = self._servers.get(name)

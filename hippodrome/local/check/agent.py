@@ -52,17 +52,17 @@ def try_agent(
     `say_long` gets a line for each call that takes long.
     """
     folder = folder.resolve()
-    found: list[Diagnostic] = []
+    diagnostics: list[Diagnostic] = []
     for group in config.each_group:
         with tempfile.TemporaryDirectory(prefix="hippodrome-check-") as temporary:
             place = Path(temporary)
             report, status = _try(folder, config, place, seconds, group, say_long=say_long)
-            found += [problem for problem in report.problems(status) if problem not in found]
+            diagnostics += [problem for problem in report.problems(status) if problem not in diagnostics]
             if report.played:
                 say(report.how_far())
-        if any(not problem.remark for problem in found):
+        if any(not problem.remark for problem in diagnostics):
             break
-    return found
+    return diagnostics
 
 
 def _try(

@@ -55,17 +55,17 @@ def never_called(folder: Path, config: Config) -> list[Diagnostic]:
     used = {part.attr for part in ast.walk(tree) if isinstance(part, ast.Attribute)}
     used |= {part.id for part in ast.walk(tree) if isinstance(part, ast.Name)}
     classes = [part for part in tree.body if isinstance(part, ast.ClassDef) and part.name == "Agent"]
-    methods = [method for each in classes for method in _unused_functions(each.body, used)]
-    members = {part.name for each in classes for part in each.body if isinstance(part, ast.FunctionDef)}
-    found = [(method.lineno, _nearly_called(method.name, members)) for method in methods]
+    methods = [method for class_node in classes for method in _unused_functions(class_node.body, used)]
+    members = {part.name for class_node in classes for part in class_node.body if isinstance(part, ast.FunctionDef)}
+    methods_found = [(method.lineno, _nearly_called(method.name, members)) for method in methods]
     if config.project.has_sessions and config.project.matching != MATCH:
         sentence = f"{MATCH}() is never called; matching: {MATCH} under project of config.yml asks for it"
-        found += [
+        methods_found += [
             (unused_function.lineno, sentence)
             for unused_function in _unused_functions(tree.body, used)
             if unused_function.name == MATCH
         ]
-    return [Diagnostic(label, line, "", sentence, remark=True) for line, sentence in found if sentence]
+    return [Diagnostic(label, line, "", sentence, remark=True) for line, sentence in methods_found if sentence]
 
 
 def _unused_functions(body: list[ast.stmt], used: set[str]) -> list[ast.FunctionDef]:
@@ -78,8 +78,8 @@ def _nearly_called(name: str, members: set[str]) -> str:
     if name in (*NAMES, *_METHODS) or name.startswith("__"):
         return ""
     callback = name.startswith("on_")
-    known = NAMES if callback else tuple(set(_METHODS) - members)
-    hint = did_you_mean(name, known, SIMILAR if callback else _SIMILAR_METHODS)
+    names = NAMES if callback else tuple(set(_METHODS) - members)
+    hint = did_you_mean(name, names, SIMILAR if callback else _SIMILAR_METHODS)
     if callback:
         hint = hint or "; docs/callbacks.md lists the callbacks"
     return f"{name} is never called by Hippodrome{hint}" if hint else ""

@@ -82,10 +82,10 @@ def _try(report: Path, deadline: Deadline) -> None:
     if config.llm is not None:
         _ask_stand_in(config.llm)
     adapter = AgentAdapter(folder, config.game, config.action_space, _reader(config, folder, progress))
-    given = _handover()
-    group = given.group if given else _group()
+    handover = _handover()
+    group = handover.group if handover else _group()
     usual_class, _EarlyEnviron.folder = os.environ.__class__, folder
-    if given:
+    if handover:
         os.environ.__class__ = _EarlyEnviron
     if not progress.call("start", lambda: start(adapter, tuple(config.players_of(group)))):
         return
@@ -100,8 +100,8 @@ def _try(report: Path, deadline: Deadline) -> None:
 
     def reset() -> Any:
         os.environ.__class__ = usual_class
-        if given:
-            assignment.set_environment(os.environ, _assigned(given))
+        if handover:
+            assignment.set_environment(os.environ, _assigned(handover))
         begin_session(games[0])
         return joint.reset(1)
 
@@ -134,7 +134,7 @@ def _talk(
     """Let the agent look at a line and answer it, if people talk; return False if that failed, which is reported."""
     methods = player.talk
     progress.known["talks"] = sorted(methods)
-    human = next(each.name for each in players if each.human)
+    human = next(player.name for player in players if player.human)
 
     def said(method: Callable[..., Any], name: str) -> None:
         result = method(progress.callbacks.session_of(name, human, None), human, LINE)
@@ -185,14 +185,14 @@ def _group() -> int | None:
     return int(text) if text else None
 
 
-def _assigned(given: Handover) -> assignment.AssignmentDocument:
+def _assigned(handover: Handover) -> assignment.AssignmentDocument:
     """The document that says who plays: the handover itself, for one participant.
 
     If the handover names a session, its document is made up, with no members: `hippodrome check` has no stored one.
     """
-    if not is_session_id(given.user_id):
-        return given
-    return SessionDocument(given.user_id, MAX_PLAYERS, (), given.group)
+    if not is_session_id(handover.user_id):
+        return handover
+    return SessionDocument(handover.user_id, MAX_PLAYERS, (), handover.group)
 
 
 def _actions(player: AgentAdapter | JointAdapter, config: TrialSection) -> dict[str, Any]:
@@ -218,9 +218,9 @@ def _note_idle(
 
     Errors are ignored: the agent has played already.
     """
-    human = next(one for one in players if one.human)
+    human = next(player for player in players if player.human)
     progress.known["idle"] = human.action_space[human.idle]
-    idle, until = {one.name: one.idle for one in players}, time.monotonic() + NO_KEY_SECONDS
+    idle, until = {player.name: player.idle for player in players}, time.monotonic() + NO_KEY_SECONDS
     with contextlib.suppress(Exception):
         joint.reset(1)
         for steps in range(1, int(NO_KEY_SECONDS * config.starting_frame_rate) + 1):
@@ -243,13 +243,13 @@ def _begin_session(
 
     What they say, nobody hears.
     """
-    humans = tuple(each.name for each in players if each.human)
+    humans = tuple(player.name for player in players if player.human)
     given = answers if answers is None or len(humans) == 1 else dict.fromkeys(humans, answers)
     player.set_game(config.options, given)
     before = progress.callbacks
     progress.callbacks = callbacks = Callbacks(
         player.callbacks,
-        TrialFacts("check", "check", None, tuple(each.name for each in players), humans, answers=given or {}),
+        TrialFacts("check", "check", None, tuple(player.name for player in players), humans, answers=given or {}),
         lambda: player.env,
         seconds=config.callback_seconds,
         stamp=dict,
@@ -276,18 +276,18 @@ def _unheard(text: str, to: str | Sequence[str] | None = None, by: str | None = 
 
 def _foreign_actions(env: Any, actions: range) -> list[int]:
     """Watch `env.step`: the list that is returned gets each action that is not among `actions`."""
-    found: list[int] = []
+    foreign_actions: list[int] = []
     step = env.step
 
     def watched(action: Any, *more: Any, **named: Any) -> Any:
         with contextlib.suppress(TypeError, ValueError):
             if int(action) not in actions:
-                found.append(int(action))
+                foreign_actions.append(int(action))
         return step(action, *more, **named)
 
     with contextlib.suppress(AttributeError):  # an object without a `__dict__` cannot be watched
         env.step = watched
-    return found
+    return foreign_actions
 
 
 def _main(report: Path) -> None:

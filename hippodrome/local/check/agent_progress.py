@@ -112,13 +112,15 @@ class AgentProgress:
         self._write(call="close", over=True, loaded=sorted(_installed_modules() - self._loaded_before))
 
     def _write(self, **fields: Any) -> None:
-        known = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": self._early}
-        known["pace"], known["matched"] = vars(self.pace), self.matched
+        progress_facts = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": self._early}
+        progress_facts["pace"], progress_facts["matched"] = vars(self.pace), self.matched
         if self.callbacks is not None:
-            known["callbacks"] = {"errors": self._callback_errors, "late": self.callbacks.first_late}
+            progress_facts["callbacks"] = {"errors": self._callback_errors, "late": self.callbacks.first_late}
         if self.undrawn:
-            known["undrawn"] = self.undrawn
-        self._append(json.dumps({**known, **self.known, "foreign": bool(self.foreign), **fields}).encode() + b"\n")
+            progress_facts["undrawn"] = self.undrawn
+        self._append(
+            json.dumps({**progress_facts, **self.known, "foreign": bool(self.foreign), **fields}).encode() + b"\n"
+        )
 
     def _append(self, line: bytes) -> None:
         with contextlib.suppress(OSError):  # the agent has closed the file

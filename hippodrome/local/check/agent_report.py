@@ -165,13 +165,13 @@ class AgentReport:
 
     def _undrawn(self) -> list[Diagnostic]:
         """Remarks on images and objects that cannot be drawn. The game goes on without them."""
-        found = []
+        diagnostics = []
         for sentence in self._report.get("undrawn", ()):
             if sentence.startswith("render(): "):
-                found.append(self._at(self._place_of("render"), short(sentence), remark=True))
+                diagnostics.append(self._at(self._place_of("render"), short(sentence), remark=True))
             else:
-                found.append(self._in_config(("trial", "scene"), short(sentence), remark=True))
-        return found
+                diagnostics.append(self._in_config(("trial", "scene"), short(sentence), remark=True))
+        return diagnostics
 
     def _too_large(self) -> list[Diagnostic]:
         """A remark on a value that is too large for the recording."""
@@ -218,17 +218,21 @@ class AgentReport:
     def _idle(self) -> list[Diagnostic]:
         """Remarks on what happens while no key is pressed, for the first group only."""
         config, report = self._config, self._report
-        taken = report.get("idle")
-        remark = remarks.without_a_key(config, report.get("actions", ()), taken)
-        if taken is None or remark is None or self._group:
+        idle_action = report.get("idle")
+        remark = remarks.without_a_key(config, report.get("actions", ()), idle_action)
+        if idle_action is None or remark is None or self._group:
             return []
-        found = [] if config.trial.action_space else [remark]  # with names in config.yml, it is made without the agent
+        remarks_of_idle = (
+            [] if config.trial.action_space else [remark]
+        )  # with names in config.yml, it is made without the agent
         steps = report.get("idleEnds")
         if steps:
             message = f"realtime, and without a key an episode ends after {steps} step{'' if steps == 1 else 's'}"
             seconds = f"{steps / config.trial.starting_frame_rate:.2g} s"
-            found.append(Remark(("trial", "pace"), f"{message} ({seconds}); write pace: turns, unless that is meant"))
-        return [self._in_config(*each, remark=True) for each in found]
+            remarks_of_idle.append(
+                Remark(("trial", "pace"), f"{message} ({seconds}); write pace: turns, unless that is meant")
+            )
+        return [self._in_config(*remark_of_idle, remark=True) for remark_of_idle in remarks_of_idle]
 
     def _unheard(self) -> list[Diagnostic]:
         """A remark on controls of feedback that reach no method of the agent, for the first group only."""
@@ -416,7 +420,7 @@ class AgentReport:
             found = remarks.arrows_of_unnamed_actions(self._config, len(names))
         else:
             found = remarks.arrows_without_an_action(self._config, names)
-        arrows = [each for each in found if source.names(each.path)]
+        arrows = [arrow for arrow in found if source.names(arrow.path)]
         keys = [] if self._config.trial.action_space else remarks.keys_without_an_action(self._config, names)
         return [self._in_config(*arrow, remark=True) for arrow in (*arrows, *keys)]
 
@@ -426,13 +430,13 @@ class AgentReport:
         policy = self._asked_policy()
         if policy is not None:
             return f"{call.rpartition(' ')[2]}() of {printable(self._plays(policy))}"
-        named = {
+        names = {
             "policies": "making the policies",
             "start": f'start("{printable(self._config.trial.game or "")}")',
             "step": f"step({self._report.get('action', 0)})",
         }.get(call, f"{call}()")
-        given = [f"{what} {json.dumps(value, ensure_ascii=False)}" for what, value in self._game().items() if value]
-        return f"{named}, with the {' and the '.join(given)}," if given else named
+        settings = [f"{what} {json.dumps(value, ensure_ascii=False)}" for what, value in self._game().items() if value]
+        return f"{names}, with the {' and the '.join(settings)}," if settings else names
 
     def _game(self) -> Mapping[str, Any]:
         """The options and answers with which an episode of another game or level was begun."""
@@ -463,7 +467,7 @@ class AgentReport:
 
     def _hung(self, stack: str) -> tuple[str, int] | None:
         """The file and line of the project's code in these stacks; None if it did not run."""
-        frames = [(Path(found["file"]), int(found["line"])) for found in _FRAME.finditer(stack)]
+        frames = [(Path(frame_match["file"]), int(frame_match["line"])) for frame_match in _FRAME.finditer(stack)]
         ours = [(self._name(file.name), line) for file, line in frames if file.parent == self._code]
         return ours[0] if ours else None
 

@@ -21,10 +21,10 @@ class Deadline:
 
     def begin(self, call: str) -> float | None:
         """Let the time of a call begin, and return its seconds; None if it may take all the time that is left."""
-        left = max(0.001, self._at - time.monotonic())  # faulthandler refuses 0
+        seconds_left = max(0.001, self._at - time.monotonic())  # faulthandler refuses 0
         limit = self._limits.get(call, math.inf)
-        self._end_after(min(limit, left))
-        return limit if limit < left else None
+        self._end_after(min(limit, seconds_left))
+        return limit if limit < seconds_left else None
 
     def _end_after(self, seconds: float) -> None:
         faulthandler.dump_traceback_later(seconds, exit=True, file=self._stack)

@@ -21,22 +21,22 @@ def check_designs(folder: Path, config: Config) -> list[Diagnostic]:
     fields = {step.key: _fields(step.files) for step in config.steps if step.files}
     games = {step.key: _fields_of_game(config, step.key) for step in config.game_steps}
     source = read_source(folder)
-    found = []
+    diagnostics = []
     for path, step, field, why in [*_of_checks(config), *_of_rules(config)]:
-        known = fields.get(step)
-        if known and field not in known | OF_EVERY_STEP:
-            message = f"the page of {step} has no field {field}{did_you_mean(field, known)}{why}"
-            found.append(source.diagnostic(path, message, remark=not why))
+        fields_of_step = fields.get(step)
+        if fields_of_step and field not in fields_of_step | OF_EVERY_STEP:
+            message = f"the page of {step} has no field {field}{did_you_mean(field, fields_of_step)}{why}"
+            diagnostics.append(source.diagnostic(path, message, remark=not why))
         elif step in games and field not in games[step]:
-            found.append(source.diagnostic(path, _no_answer_of_game(step, field, games[step])))
-    return found + list(_not_offered(config, source)) + list(_never_compared(config, source))
+            diagnostics.append(source.diagnostic(path, _no_answer_of_game(step, field, games[step])))
+    return diagnostics + list(_not_offered(config, source)) + list(_never_compared(config, source))
 
 
-def _no_answer_of_game(step: str, field: str, known: list[str]) -> str:
+def _no_answer_of_game(step: str, field: str, fields: list[str]) -> str:
     if field == "reached":
         remedy = f"; give {step} a criterion, such as until: {{success: 3}}"
     else:
-        remedy = did_you_mean(field, known) or f"; it has {', '.join(known)}"
+        remedy = did_you_mean(field, fields) or f"; it has {', '.join(fields)}"
     return f"the answer of the game {step} has no {field}{remedy}"
 
 
@@ -55,7 +55,7 @@ def _not_offered(config: Config, source: ConfigSource) -> Iterator[Diagnostic]:
             path = (*config.design.paths.get(step.key, ("project", "steps")), "right", field)
             for file in step.files:
                 choices = _choices(file, field)
-                if choices and str(right).strip().casefold() not in [each.strip().casefold() for each in choices]:
+                if choices and str(right).strip().casefold() not in [choice.strip().casefold() for choice in choices]:
                     message = f"{file.name} offers no {right} for {field}; it has {', '.join(choices)}"
                     yield source.diagnostic(path, message)
 

@@ -150,7 +150,7 @@ class EarlierAnswers:
         return source_of(self._folder / step.files[(group or 0) % len(step.files)].name)
 
     def variants(
-        self, group: int | None, constants: Collection[str | float], named: Container[object]
+        self, group: int | None, constants: Collection[str | float], container: Container[object]
     ) -> Iterator[Variant]:
         """Yield sets of answers that differ in one answer, with the words for it.
 
@@ -174,7 +174,7 @@ class EarlierAnswers:
             else:
                 continue
             for name, possible in values.items():
-                for value in dict.fromkeys(possible) if name in named else ():
+                for value in dict.fromkeys(possible) if name in container else ():
                     words = f"{name} = {json.dumps(value, ensure_ascii=False)} at step {step.key}"
                     yield Variant({**most, step.key: {**most[step.key], name: value}}, f"{step.key}.{name}", words)
 

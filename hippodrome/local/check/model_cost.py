@@ -29,11 +29,11 @@ def _of_game(config: Config, key: str) -> float | None:
     step = next((one for one in config.design.steps if one.key == key), None)
     own = [section.trial.get("llm") for section in step.sections] if step else []
     costs = [_cost(section) for section in (*own, config.trial.registered().get("llm")) if section]
-    known = [cost for cost in costs if cost is not None]
-    if not known:
+    known_costs = [cost for cost in costs if cost is not None]
+    if not known_costs:
         return None
     runs = config.design.blocks[step.block].length if step is not None and step.block is not None else 1
-    return max(known) * runs
+    return max(known_costs) * runs
 
 
 def _cost(section: Mapping[str, Any]) -> float | None:

@@ -58,13 +58,13 @@ def _of_all(folder: Path, names: Iterable[str], config: Config) -> list[Diagnost
     """Problems that follow from where the study shows its pages."""
     used = _pages(names, config)
     unused = sorted(name for name in names if name.endswith(".html") and name not in used)
-    found = [_unused(folder, unused)] if unused else []
+    diagnostics = [_unused(folder, unused)] if unused else []
     if config.project.use_aws:
-        found += [_too_large(folder, name) for name in sorted(names) if _size(folder / name) > MAX_BYTES]
+        diagnostics += [_too_large(folder, name) for name in sorted(names) if _size(folder / name) > MAX_BYTES]
     if not config.project.keeps_off_aws and not config.project.signed_links:  # strangers may come, from a recruiter
         last = dict.fromkeys(file.name for file in config.steps[-1].files)
-        found += [_no_code(f"{folder.name}/{name}") for name in last if not _leads_back(source_of(folder / name))]
-    return found
+        diagnostics += [_no_code(f"{folder.name}/{name}") for name in last if not _leads_back(source_of(folder / name))]
+    return diagnostics
 
 
 def _is_sent(config: Config, name: str, source: str) -> bool:

@@ -31,8 +31,8 @@ def remedy(kind: str, text: str, game: str = "Id-v0") -> str:
     `kind` is the name of the exception's class, and `game` the id of the environment.
     """
     if kind == "DependencyNotInstalled":  # the error's text names the packages, as Gymnasium calls them
-        named = _INSTALL.findall(text)  # the last one is Gymnasium's own, with what the game needs
-        package = f": {named[-1]}" if named else ""
+        commands = _INSTALL.findall(text)  # the last one is Gymnasium's own, with what the game needs
+        package = f": {commands[-1]}" if commands else ""
         return f"; instead of installing it by hand, name it in a requirements.txt beside agent.py{package}"
     if kind in _UNREGISTERED:
         return "" if "Did you mean" in text else _of_id(game)

@@ -45,10 +45,10 @@ def spans(text: str, *kinds: Marks) -> Iterator[Span]:
     at = 0
     following = {kind: kind.opening.search(text) for kind in kinds}
     while True:
-        for kind, found in following.items():
-            if found and found.start() < at:
+        for kind, following_match in following.items():
+            if following_match and following_match.start() < at:
                 following[kind] = kind.opening.search(text, at)
-        first = min(((found.start(), n) for n, found in enumerate(following.values()) if found), default=None)
+        first = min(((match.start(), n) for n, match in enumerate(following.values()) if match), default=None)
         if first is None:
             return
         kind = list(following)[first[1]]

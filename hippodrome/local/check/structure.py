@@ -137,7 +137,9 @@ class _Reader(PageParser):
             self._left += self._open[place + 1 :]
             del self._open[place:]
         elif tag in (name for name, _ in self._left):
-            self._left = [each for each in self._left if each[0] != tag]  # closed in another order: browsers mend it
+            self._left = [
+                open_tag for open_tag in self._left if open_tag[0] != tag
+            ]  # closed in another order: browsers mend it
         else:
             self._strays.append((tag, self.getpos()[0]))
 
@@ -181,20 +183,24 @@ class _Reader(PageParser):
         Only radio buttons between the same {% … %} are compared.
         """
         for number, radio in enumerate(radios):
-            before = [each for each in radios[:number] if each.blocks == radio.blocks]
-            same = [each for each in radios[number:] if each.blocks == radio.blocks]
+            before = [radio_button for radio_button in radios[:number] if radio_button.blocks == radio.blocks]
+            same = [radio_button for radio_button in radios[number:] if radio_button.blocks == radio.blocks]
             if not before:
                 continue
             if (
                 radio.value is not None
                 and spans.MARK not in radio.value
-                and radio.value in [each.value for each in before]
+                and radio.value in [radio_button.value for radio_button in before]
             ):
                 return radio
             for place in ("fieldset", "row"):
-                here, earlier = getattr(radio, place), Counter(getattr(each, place) for each in before)
-                begins = here and here not in earlier and sum(getattr(each, place) == here for each in same) > 1
-                if begins and any(count > 1 for one, count in earlier.items() if one):
+                here, earlier = getattr(radio, place), Counter(getattr(radio_button, place) for radio_button in before)
+                begins = (
+                    here
+                    and here not in earlier
+                    and sum(getattr(radio_button, place) == here for radio_button in same) > 1
+                )
+                if begins and any(count > 1 for text, count in earlier.items() if text):
                     return radio
         return None
 

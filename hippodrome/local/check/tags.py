@@ -50,11 +50,11 @@ class Tags(PageParser):
         return [*self._found, *self._without_a_name()]
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {name: value.strip() for name, value in attributes_of(attrs).items()}
+        attributes = {name: value.strip() for name, value in attributes_of(attrs).items()}
         self._styling = tag == "style"
-        self._field(tag, given)
-        self._left_out(tag, given)
-        for name, value in given.items():
+        self._field(tag, attributes)
+        self._left_out(tag, attributes)
+        for name, value in attributes.items():
             if _HANDLER.fullmatch(name) and value:
                 self._remark(f"{name} never runs; use addEventListener in a <script> of the page")
             elif name in ("href", "src", "action") and value.lower().startswith("javascript:"):
@@ -67,7 +67,7 @@ class Tags(PageParser):
                 self._mistake("a form is never sent to another site; take formaction out")
             elif name in _LOADED.get(tag, ()):
                 for address in _IN_SRCSET.findall(value) if name == "srcset" else [value]:
-                    self._address(tag, address, given)
+                    self._address(tag, address, attributes)
 
     def handle_endtag(self, tag: str) -> None:
         self._styling = False
@@ -76,20 +76,20 @@ class Tags(PageParser):
         if self._styling:
             self._style(data)
 
-    def _field(self, tag: str, given: dict[str, str]) -> None:
-        kind = given.get("type", "").lower() if tag == "input" else tag
+    def _field(self, tag: str, attributes: dict[str, str]) -> None:
+        kind = attributes.get("type", "").lower() if tag == "input" else tag
         if kind == "file":
             self._mistake("files cannot be sent; take this field out")
-        elif tag in ("input", "select", "textarea") and kind not in BUTTONS and not given.get("name"):
+        elif tag in ("input", "select", "textarea") and kind not in BUTTONS and not attributes.get("name"):
             self._unnamed.append((self.getpos()[0], tag))
 
-    def _left_out(self, tag: str, given: dict[str, str]) -> None:
+    def _left_out(self, tag: str, attributes: dict[str, str]) -> None:
         """Remark on tags that the frame leaves out, where a page would need them."""
-        if tag == "meta" and given.get("http-equiv", "").lower() == "refresh":
+        if tag == "meta" and attributes.get("http-equiv", "").lower() == "refresh":
             self._remark('<meta http-equiv="refresh"> does nothing; write a link and a <script> (docs/recruiting.md)')
-        elif tag == "base" and given.get("href"):
+        elif tag == "base" and attributes.get("href"):
             self._remark("<base> does nothing; write the whole address in each tag")
-        elif tag == "form" and self._is_elsewhere(given.get("action", "")):
+        elif tag == "form" and self._is_elsewhere(attributes.get("action", "")):
             self._remark("the answers are stored as those of this study, and are not sent to the form's action")
 
     @staticmethod
@@ -108,16 +108,16 @@ class Tags(PageParser):
         return [Diagnostic(self._label, first, "", message, remark=True)]
 
     def _style(self, text: str) -> None:
-        for found in _IN_STYLE.finditer(text):
-            address = found[1]
+        for match in _IN_STYLE.finditer(text):
+            address = match[1]
             if spans.MARK not in address and not address.startswith(("/", "#")) and not _SCHEME.match(address):
                 place = f"{self._own or '/steps/your-project/'}{address.removeprefix('./')}"
-                line = text[: found.start()].count("\n")
+                line = text[: match.start()].count("\n")
                 self._remark(f"{short(address)} is not found from a style; write url({short(place)})", line)
 
-    def _address(self, tag: str, address: str, given: dict[str, str]) -> None:
+    def _address(self, tag: str, address: str, attributes: dict[str, str]) -> None:
         """Check whether the file or the page at this address can be loaded."""
-        relations = given.get("rel", "").lower().split()
+        relations = attributes.get("rel", "").lower().split()
         if not address or (tag == "link" and not {"stylesheet", "icon"} & set(relations)):
             return
         if self._on_disk(address):
@@ -188,8 +188,8 @@ class Tags(PageParser):
             self._mistake(f"<{tag}> is never shown; use <img>, <video>, <audio> or <iframe>")
         elif self._hosts is not None and origin not in self._hosts:
             secure = origin.replace("http://", "https://", 1)
-            known = "write https:// here" if secure in self._hosts else f"add {short(secure)} to allowedHosts"
-            self._mistake(f"{short(origin)} is not in allowedHosts of the config file, so nothing is loaded; {known}")
+            advice = "write https:// here" if secure in self._hosts else f"add {short(secure)} to allowedHosts"
+            self._mistake(f"{short(origin)} is not in allowedHosts of the config file, so nothing is loaded; {advice}")
 
     def _file(self, path: str) -> None:
         """Check whether this file of the project exists and is shown."""

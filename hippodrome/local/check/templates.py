@@ -81,16 +81,16 @@ def _group_of_nobody(label: str, parsed: nodes.Template, config: Config | None) 
     """A remark if the page compares `group` with a number in a study without groups: all see the same branch."""
     if config is None or config.groups:
         return
-    for found in parsed.find_all(nodes.Compare):
+    for comparison in parsed.find_all(nodes.Compare):
         with_number = any(
-            isinstance(operand.expr, nodes.Const) and isinstance(operand.expr.value, int) for operand in found.ops
+            isinstance(operand.expr, nodes.Const) and isinstance(operand.expr.value, int) for operand in comparison.ops
         )
-        if isinstance(found.expr, nodes.Name) and found.expr.name == "group" and with_number:
+        if isinstance(comparison.expr, nodes.Name) and comparison.expr.name == "group" and with_number:
             message = (
                 "the study has no groups, so all participants see the same branch; groups come from versions of a "
             )
             message += "page, such as consent-0.html and consent-1.html (docs/pages.md#groups)"
-            yield Diagnostic(label, found.lineno, "", message, remark=True)
+            yield Diagnostic(label, comparison.lineno, "", message, remark=True)
             return
 
 
@@ -103,11 +103,11 @@ def _shown(
 ) -> Iterator[Diagnostic]:
     """Problems in showing the page to participants with different answers: it fails, or they cannot send it."""
     constants = [node.value for node in parsed.find_all(nodes.Const) if isinstance(node.value, str | int | float)]
-    named = {*constants, *(node.attr for node in parsed.find_all(nodes.Getattr))}
+    names_shown = {*constants, *(node.attr for node in parsed.find_all(nodes.Getattr))}
     stuck: list[Variant] = []
     others: set[str] = set()  # the special answers of those who can go on
     for group in visitors.groups:
-        for variant in islice(visitors.earlier.variants(group, constants, named), MOST_SHOWN):
+        for variant in islice(visitors.earlier.variants(group, constants, names_shown), MOST_SHOWN):
             values = _values(config, group)
             if config:
                 values["participant"] |= _company(variant.answers, config)
@@ -149,13 +149,13 @@ def _unread(error: TemplateSyntaxError) -> str:
 
 def _unknown(label: str, parsed: nodes.Template, environment: Any) -> Iterator[Diagnostic]:
     """Filters and tests that do not exist. Jinja itself finds them inside an {% if %} only if its condition is true."""
-    for kind, node_type, known in (
+    for kind, node_type, names in (
         ("filter", nodes.Filter, environment.filters),
         ("test", nodes.Test, environment.tests),
     ):
         for node in parsed.find_all(node_type):
-            if node.name not in known:
-                message = f"there is no {kind} {short(node.name)} in Jinja{did_you_mean(node.name, known)}"
+            if node.name not in names:
+                message = f"there is no {kind} {short(node.name)} in Jinja{did_you_mean(node.name, names)}"
                 yield Diagnostic(label, node.lineno, "", message)
 
 

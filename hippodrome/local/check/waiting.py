@@ -20,16 +20,16 @@ def wait(process: Popen[Any], seconds: float, report: Path, long: Callable[[], N
     `long` is called for each call that takes long.
     """
     until = time.monotonic() + seconds
-    said: float | None = None
+    last_said: float | None = None
     while True:
-        left = until - time.monotonic()
+        seconds_left = until - time.monotonic()
         with contextlib.suppress(TimeoutExpired):
-            return process.wait(max(0.01, min(_LOOK_SECONDS, left)))
-        if left <= _LOOK_SECONDS:
+            return process.wait(max(0.01, min(_LOOK_SECONDS, seconds_left)))
+        if seconds_left <= _LOOK_SECONDS:
             return None
         began = _began(report)
-        if began is not None and began != said and time.time() - began >= LONG:
-            said = began
+        if began is not None and began != last_said and time.time() - began >= LONG:
+            last_said = began
             long()
 
 

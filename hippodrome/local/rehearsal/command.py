@@ -218,20 +218,22 @@ def _rehearse_and_report(
     with _bar(console, len(ends.goals()) if ends else crowd.bots) as watch:
         walking = _to_ends(ends, link, crowd, watch) if ends else rehearse(link, crowd, watch)
         reports = interruptible(walking)
-    left = None
+    servers_left = None
     if data:
         ids = {bot.user_id for bot in reports}
         sessions = sessions_of(data, config.project.id, ids)
-        left = wait_until_gone(data, ids | sessions | (sessions_not_open(data, config.project.id) if study else set()))
-    if study and left:
-        left.local_mode_killed = not study.interrupt()
-        left.processes = max(left.processes, study.clear())
-    found = verify(data, config.project.id, reports, recorded=config.trial.s3upload) if data else None
+        servers_left = wait_until_gone(
+            data, ids | sessions | (sessions_not_open(data, config.project.id) if study else set())
+        )
+    if study and servers_left:
+        servers_left.local_mode_killed = not study.interrupt()
+        servers_left.processes = max(servers_left.processes, study.clear())
+    verification = verify(data, config.project.id, reports, recorded=config.trial.s3upload) if data else None
     fine = report(
         console,
         reports,
-        found,
-        left,
+        verification,
+        servers_left,
         time.monotonic() - began,
         play=crowd.play,
         recorded=config.trial.s3upload,

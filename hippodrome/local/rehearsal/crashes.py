@@ -43,7 +43,7 @@ class ServerLogs:
 
         `names` maps texts to those that replace them in the errors.
         """
-        found: dict[str, AgentCrash] = {}
+        by_message: dict[str, AgentCrash] = {}
         for log in self._logs():
             try:
                 new = log.read_bytes()[self._sizes.get(log, 0) :].decode("utf-8", "replace")
@@ -52,8 +52,8 @@ class ServerLogs:
             for before, after in names.items():
                 new = new.replace(before, after)
             for crash in read(new.splitlines()):
-                found.setdefault(crash.text, crash).count += 1
-        return sorted(found.values(), key=lambda crash: -crash.count)
+                by_message.setdefault(crash.text, crash).count += 1
+        return sorted(by_message.values(), key=lambda crash: -crash.count)
 
     def _logs(self) -> list[Path]:
         return sorted(log for log in self._folder.glob("*.log") if log.name != "functions.log")

@@ -105,8 +105,8 @@ class Ends:
 
     def games_asked(self, end: End) -> list[str]:
         """The games about whose answers a rule of the end asks. Bots play them by chance."""
-        asked = {names[1] for rule in end.when for names in rules.mentioned(rule) if names[0] == "answers"}
-        return sorted(step.key for step in self.design.steps if step.type.on_server and step.key in asked)
+        steps = {names[1] for rule in end.when for names in rules.mentioned(rule) if names[0] == "answers"}
+        return sorted(step.key for step in self.design.steps if step.type.on_server and step.key in steps)
 
     async def rehearse(self, link: str, watch: Watch, *, at_once: int, ramp: float, **bot: Any) -> list[BotReport]:
         """Send bots until nothing is left to reach, at most ROUNDS times. Return their reports.

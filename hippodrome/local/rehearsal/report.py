@@ -124,7 +124,7 @@ def _together(reports: Sequence[BotReport]) -> Rows:
     if not waited and not any(play.unmatched or play.members > 1 for play in plays):
         return []
     sizes = Counter(game[0].members for game in _games(reports))
-    made = " and ".join(
+    sentence = " and ".join(
         f"{count} with {size} participant{'' if size == 1 else 's'}"
         for size, count in sorted(sizes.items(), reverse=True)
     )
@@ -133,7 +133,7 @@ def _together(reports: Sequence[BotReport]) -> Rows:
     alone = [bot.user_id for bot in reports if any(play.unmatched for play in bot.plays)]
     names = ", ".join(alone[:SHOWN_NAMES]) + (" …" if len(alone) > SHOWN_NAMES else "")
     return [
-        ("games played together", made or "none"),
+        ("games played together", sentence or "none"),
         *([("wait in the lobby", _spread(waited))] if waited else []),
         ("unmatched", f"{len(alone)}: {names}" if alone else "0"),
         *([("ended early", ended)] if ended else []),

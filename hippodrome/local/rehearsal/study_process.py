@@ -224,14 +224,14 @@ def copy_of(project: Path, folder: Path) -> list[str]:
 
 def _without_least_times(steps: Any) -> bool:
     """Remove `minSeconds` from pages in a list of steps, also from those in blocks; return whether there were any."""
-    found = False
+    has_least_times = False
     for item in steps if isinstance(steps, list) else ():
         for name, settings in item.items() if isinstance(item, dict) else ():
             if name == "steps":
-                found |= _without_least_times(settings)
+                has_least_times |= _without_least_times(settings)
             elif isinstance(settings, dict):
-                found |= settings.pop("minSeconds", None) is not None
-    return found
+                has_least_times |= settings.pop("minSeconds", None) is not None
+    return has_least_times
 
 
 def _copy_policies(project: Path, folder: Path, trial: Mapping[str, Any]) -> None:
@@ -239,8 +239,8 @@ def _copy_policies(project: Path, folder: Path, trial: Mapping[str, Any]) -> Non
 
     Local mode reports the mistakes in `players` and `substitute`.
     """
-    named = {key: trial.get(key) for key in ("players", "substitute")}
-    for top in {Path(file).parts[0] for _, file in who.files(named) if "{" in file or (project / file).is_file()}:
+    policies = {key: trial.get(key) for key in ("players", "substitute")}
+    for top in {Path(file).parts[0] for _, file in who.files(policies) if "{" in file or (project / file).is_file()}:
         if not (folder / top).is_symlink():
             continue
         (folder / top).unlink()
@@ -266,7 +266,7 @@ def sessions_not_open(data: Path, project_id: str) -> set[str]:
 
     The servers of open sessions were started ahead, and wait for participants who may still come.
     """
-    ahead = {each["id"] for each in document(data / decisions.key(project_id)).get("open", ())}
+    ahead = {session_ahead["id"] for session_ahead in document(data / decisions.key(project_id)).get("open", ())}
     owners = {str(document(path).get("userId")) for path in (data / "_servers").glob("*.json")}
     return {owner for owner in owners - ahead if is_session_id(owner)}
 

@@ -67,10 +67,10 @@ def headers_of(scope: Scope) -> list[tuple[str, str]]:
 
 def joined(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
     """Return the values by their names. Values of the same name are joined by commas, as API Gateway does."""
-    found: dict[str, str] = {}
+    fields: dict[str, str] = {}
     for name, value in pairs:
-        found[name] = f"{found[name]},{value}" if name in found else value
-    return found
+        fields[name] = f"{fields[name]},{value}" if name in fields else value
+    return fields
 
 
 def event_of(scope: Scope, body: bytes, route: Route, parameters: Mapping[str, str]) -> dict[str, Any]:

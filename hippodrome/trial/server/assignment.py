@@ -27,33 +27,37 @@ AssignmentDocument = Handover | SessionDocument
 """A document that says who plays on a server."""
 
 
-def with_handover(settings: TrialSettings, found: Handover) -> TrialSettings:
+def with_handover(settings: TrialSettings, handover: Handover) -> TrialSettings:
     """Return the settings of a warm server with what its handover `found` says: who plays there, or which session."""
-    if is_session_id(found.user_id):
-        return replace(settings, warm_server=False, session=found.user_id, group=found.group, server=found.server)
-    return replace(settings, warm_server=False, user_id=found.user_id, group=found.group, server=found.server)
+    if is_session_id(handover.user_id):
+        return replace(
+            settings, warm_server=False, session=handover.user_id, group=handover.group, server=handover.server
+        )
+    return replace(settings, warm_server=False, user_id=handover.user_id, group=handover.group, server=handover.server)
 
 
-def with_members(settings: TrialSettings, found: SessionDocument) -> TrialSettings:
+def with_members(settings: TrialSettings, session_document: SessionDocument) -> TrialSettings:
     """Return the settings of a session's server with the members of the document. Raises BadSession."""
-    if found.id != settings.session:
+    if session_document.id != settings.session:
         raise BadSession("its document is that of another session")
-    return replace(settings, players=found.players, members=found.members, group=found.group)
+    return replace(
+        settings, players=session_document.players, members=session_document.members, group=session_document.group
+    )
 
 
-def set_environment(environment: MutableMapping[str, str], found: AssignmentDocument | None) -> None:
+def set_environment(environment: MutableMapping[str, str], assignment_document: AssignmentDocument | None) -> None:
     """Set the environment variables that tell the researcher's code who plays; remove them if that is not `found` yet.
 
     For a session they hold its id and group; no variable holds a participant's id.
     """
     for name in (*variables.PARTICIPANT, variables.SESSION):
         environment.pop(name, None)
-    if isinstance(found, SessionDocument):
-        environment[variables.SESSION] = found.id
-        environment[variables.GROUP] = variables.group_text(found.group)
-    elif found is not None and not is_session_id(found.user_id):
-        environment[variables.USER_ID] = found.user_id
-        environment[variables.GROUP] = variables.group_text(found.group)
+    if isinstance(assignment_document, SessionDocument):
+        environment[variables.SESSION] = assignment_document.id
+        environment[variables.GROUP] = variables.group_text(assignment_document.group)
+    elif assignment_document is not None and not is_session_id(assignment_document.user_id):
+        environment[variables.USER_ID] = assignment_document.user_id
+        environment[variables.GROUP] = variables.group_text(assignment_document.group)
 
 
 class Search:

@@ -35,7 +35,7 @@ async def read_earlier(store: Store, settings: TrialSettings, over: Collection[s
         for (user, key), body in zip(missing, bodies, strict=True):
             if body is not None:
                 put(found[user], settings.answers[key], answers_in(body) or {})
-        missing = [wanted for wanted, body in zip(missing, bodies, strict=True) if body is None]
+        missing = [name for name, body in zip(missing, bodies, strict=True) if body is None]
         left = until - asyncio.get_running_loop().time()
         if left <= 0 or all(user in over for user, _ in missing):
             return found

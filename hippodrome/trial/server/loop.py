@@ -220,15 +220,15 @@ class TrialLoop:
         if answers is not None:
             self._apply(self.core.already_played(answers))
             return
-        given = await self._answers_given(answered)
+        answers_given = await self._answers_given(answered)
         started = await agent_ready
         playing = None if started is None else await self._players_of(started)
-        if started is None or playing is None or given is None or not await self._read_tape():
+        if started is None or playing is None or answers_given is None or not await self._read_tape():
             self._apply(self.core.agent_failed(self._loop.time()))
             return
         recorded = await self._recorder.recorded()
-        by_player = {player: given[user_id] for user_id, player in playing.places.items()}
-        earlier = by_player if self.settings.session else given[self.settings.user_id]
+        by_player = {player: answers_given[user_id] for user_id, player in playing.places.items()}
+        earlier = by_player if self.settings.session else answers_given[self.settings.user_id]
         self._calls = self._calls_of(started, playing, earlier)
         try:
             self._use_model()

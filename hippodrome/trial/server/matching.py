@@ -114,5 +114,5 @@ def read(body: bytes) -> dict[str, Any] | None:
         return None
     if not isinstance(players, int) or not 2 <= players <= MAX_PLAYERS:
         return None
-    valid = all(isinstance(each, dict) and isinstance(each.get("id"), str) for each in waiting)
+    valid = all(isinstance(person, dict) and isinstance(person.get("id"), str) for person in waiting)
     return {"id": question_id, "players": players, "waiting": waiting} if valid else None

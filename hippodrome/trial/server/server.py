@@ -150,7 +150,7 @@ class TrialServer:
         if self._endpoint is not None and reason != "done":  # or the next server would pay for the same calls again
             await asyncio.to_thread(self._endpoint.close, seconds / 2)
             seconds /= 2
-        await asyncio.gather(*(each.close(seconds) for each in self._trials))
+        await asyncio.gather(*(trial.close(seconds) for trial in self._trials))
         if not self._agent_ready.done():
             self._agent_ready.cancel()
         if not self._worker.busy:
@@ -198,12 +198,12 @@ class TrialServer:
             return
         await Matching(self._store, lambda: self.settings, function).run()
 
-    async def _assign(self, settings: TrialSettings, found: AssignmentDocument) -> None:
+    async def _assign(self, settings: TrialSettings, assignment_document: AssignmentDocument) -> None:
         """Use the new settings, which follow from the document `found` that says who plays here."""
         if self.settings.warm_server:
             self._in_background(self._store_files(await self._leftovers(settings)))
             log.info("this server is assigned to a %s now", "session" if settings.session else "participant")
-        set_environment(os.environ, found)
+        set_environment(os.environ, assignment_document)
         self.settings = settings
         if settings.session and settings.assigned:
             log.info("the members of the session are known now: %d of %d", len(settings.seats), settings.players)
@@ -362,7 +362,7 @@ class TrialServer:
             step = trial.core.step if trial is not None and not trial.core.finished else self._next_step()
         if trial is not None and trial.core.step == step:
             return trial
-        unstored = next((each for each in self._trials if each.core.step == step and each.core.saving), None)
+        unstored = next((trial for trial in self._trials if trial.core.step == step and trial.core.saving), None)
         if unstored is not None:
             return unstored
         if trial is not None and not trial.core.played:

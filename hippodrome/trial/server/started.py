@@ -91,9 +91,11 @@ class StartedAgent:
                 )
             return replace(playing, places=places, seats=tuple(seats), erased=vacant)
         away = seats if config.after_absent == "policy" else vacant
-        stand_ins = self._policies([replace(each, plays=substitute) for each in playing.players if each.name in away])
+        stand_ins = self._policies(
+            [replace(player, plays=substitute) for player in playing.players if player.name in away]
+        )
         return TrialPlayers(
-            tuple(replace(each, plays=substitute) if each.name in vacant else each for each in playing.players),
+            tuple(replace(player, plays=substitute) if player.name in vacant else player for player in playing.players),
             {**playing.policies, **{name: stand_ins[name] for name in vacant}},
             places,
             tuple(seats),
