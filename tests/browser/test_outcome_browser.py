@@ -66,6 +66,23 @@ def test_at_the_end_of_a_game_its_last_picture_and_score_are_seen_whole(
     assert box(phone, ".stage") == pytest.approx(before), "the picture stays where it is"
 
 
+@pytest.mark.parametrize("size", [(1280, 800), (1920, 1080), (2560, 1440)], ids=lambda size: f"{size[0]}")
+@pytest.mark.parametrize("scene", [{"height": 640}, {"height": 1260}], ids=["landscape", "portrait"])
+def test_header_status_picture_and_controls_are_one_grid(
+    world: World, tab: Any, size: tuple[int, int], scene: dict[str, Any]
+) -> None:
+    play_on(world, tab, size, {"scene": scene}, ALL)
+    name, progress, status, picture, controls, keys = (
+        box(tab, each) for each in (".study", ".progress", ".hud", ".stage", "#controls", "#legend")
+    )
+    assert name["x"] == pytest.approx(status["x"], abs=1)
+    assert progress["x"] + progress["width"] == pytest.approx(controls["x"] + controls["width"], abs=1)
+    assert 2 * picture["x"] + picture["width"] == pytest.approx(size[0], abs=2), "the picture is in the middle"
+    hands = controls["y"] + keys["y"] + keys["height"]
+    assert 2 * picture["y"] + picture["height"] == pytest.approx(hands, abs=2), "controls are beside its middle"
+    assert max(picture["width"] / size[0], picture["height"] / size[1]) > 0.6
+
+
 CHOICES = ["cooperate", "defect"]
 
 
