@@ -182,7 +182,7 @@ def _game_step(checked: Checked) -> Iterator[Mistake]:
 
 def _together(checked: Checked) -> Iterator[Mistake]:
     """Participants who play together are assigned when they are matched, at the first game; each game is for all."""
-    design, wanted = checked.design, checked.project.players
+    design, people = checked.design, checked.project.players
     if not checked.project.has_sessions:
         return
     first = next((at for at, step in enumerate(design.steps) if step.type.on_server), len(design.steps))
@@ -195,16 +195,16 @@ def _together(checked: Checked) -> Iterator[Mistake]:
         why = "the last page names a factor, and participants who are matched with nobody have no condition"
         what = "name one page for all, and ask in it for condition, such as {% if condition.pay %}"
         yield Mistake(design.paths[design.steps[-1].key], f"{why}; {what}")
-    if any(len(humans) != wanted for _, humans in checked.trial.humans()):
+    if any(len(humans) != people for _, humans in checked.trial.humans()):
         return  # that is said of trial.players
     for step in design.steps:
         for section in step.sections:
             players = section.trial.get("players")
-            humans = [*players.values()].count(HUMAN) if isinstance(players, dict) else wanted
-            if humans != wanted:
+            humans = [*players.values()].count(HUMAN) if isinstance(players, dict) else people
+            if humans != people:
                 at = ", ".join(f"{name}: {level}" for name, level in section.levels.items())
                 are = f"{humans} of the players are human{f' with {at}' if at else ''}"
-                message = f"{are}, and project.players is {wanted}; all who play together play each game"
+                message = f"{are}, and project.players is {people}; all who play together play each game"
                 yield Mistake(design.paths[step.key], message)
                 break
 

@@ -159,19 +159,19 @@ class _Reader:
         self._block_now: int | None = None
 
     def read(self, project: dict[str, Any]) -> None:
-        found = self.design
+        design_read = self.design
         conditions = project.get("conditions")
         if isinstance(conditions, dict):
             factors = [self._factor(name, levels, (*CONDITIONS, name)) for name, levels in conditions.items()]
-            found.conditions = tuple(factor for factor in factors if factor is not None)
+            design_read.conditions = tuple(factor for factor in factors if factor is not None)
         elif not is_blank(conditions):
             self._wrong(CONDITIONS, "must be a map of factors, such as partner: [helpful, lazy]")
-        cells = len(design.cells(found.conditions))
+        cells = len(design.cells(design_read.conditions))
         if cells > MAX_CELLS:
             self._wrong(CONDITIONS, f"makes {cells} cells; at most {MAX_CELLS}")
         steps = project.get("steps")
         if isinstance(steps, list):
-            found.is_named = True
+            design_read.is_named = True
             self._steps(steps)
         elif isinstance(steps, dict):
             for key, page in steps.items():
@@ -181,7 +181,7 @@ class _Reader:
                         (*STEPS, key),
                         f"settings need the list form, in which steps have names: - {name}: {{…}} instead of {key}: …",
                     )
-        if not found.mistakes:  # otherwise a rule would ask about steps that could not be read
+        if not design_read.mistakes:  # otherwise a rule would ask about steps that could not be read
             self._ends(project.get("ends"))
             self._unknown_factors()
             self._checks_without_an_end()
@@ -271,11 +271,11 @@ class _Reader:
                 (*path, key),
                 f"unknown key of a block{did_you_mean(str(key), BLOCK_KEYS)}; it has {', '.join(BLOCK_KEYS)}",
             )
-        each, steps = item.get("each"), item.get("steps")
-        if not isinstance(each, dict) or not each:
+        factor_levels, steps = item.get("each"), item.get("steps")
+        if not isinstance(factor_levels, dict) or not factor_levels:
             self._wrong((*path, "each"), "must be a map of factors, such as {look: [plain, face, voice]}")
             return
-        factors = [self._factor(name, levels, (*path, "each", name)) for name, levels in each.items()]
+        factors = [self._factor(name, levels, (*path, "each", name)) for name, levels in factor_levels.items()]
         order = _text(item.get("order", design.LATIN))
         if order not in design.ORDERS:
             self._wrong((*path, "order"), f"must be {' or '.join(design.ORDERS)}, not {show(item.get('order'))}")
@@ -460,8 +460,8 @@ class _Reader:
                 (*path, key),
                 f"unknown setting of an end{did_you_mean(str(key), END_KEYS)}; it has {', '.join(END_KEYS)}",
             )
-        given = settings.get("when")
-        some = given if isinstance(given, list) else [] if is_blank(given) else [given]
+        rule_given = settings.get("when")
+        some = rule_given if isinstance(rule_given, list) else [] if is_blank(rule_given) else [rule_given]
         rules = [self._rule(rule, (*path, "when") if "when" in settings else path) for rule in some]
         minutes = self._number(settings.get("minutes"), (*path, "minutes"), 1, 100_000)
         if not some and minutes is None and name not in (COMPLETE, FAILED):
@@ -575,8 +575,10 @@ def _sections(design: Design, step: Step, plain: Mapping[str, Any]) -> Iterator[
     factors_used = [factors[name] for name in factors if name in named_factors(written)]
     for cell in itertools.product(*(factor.levels.items() for factor in factors_used)):
         levels = {factor.name: name for factor, (name, _) in zip(factors_used, cell, strict=True)}
-        given = filled(written, {factor.name: value for factor, (_, value) in zip(factors_used, cell, strict=True)})
-        section, problems = check_trial(given)
+        section_filled = filled(
+            written, {factor.name: value for factor, (_, value) in zip(factors_used, cell, strict=True)}
+        )
+        section, problems = check_trial(section_filled)
         own = design.own_trial.get(step.key, {})
         mistakes = [problem for problem in problems if problem.path[:1] and (problem.path[0] in own or factors_used)]
         if mistakes:

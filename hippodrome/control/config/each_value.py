@@ -76,17 +76,17 @@ def check_values(
 
 def _check_design(checked: Checked) -> None:
     """Take over the steps of the design, and check each game with what it has for itself."""
-    found = checked.design
-    if found.is_named:
-        checked.step_keys = list(found.pages)
-        checked.project = replace(checked.project, steps=found.pages)
+    design_checked = checked.design
+    if design_checked.is_named:
+        checked.step_keys = list(design_checked.pages)
+        checked.project = replace(checked.project, steps=design_checked.pages)
     else:
         pages = checked.project.steps
-        found.steps = [Step(key, pages[key]) for key in visited(ordered(pages), pages)]
-        found.paths = {key: (*STEPS, key) for key in pages}
-    if checked.valid(("trial",)) and not found.mistakes:
-        found.steps = design.with_sections(found, checked.trial)
-    for mistake in found.mistakes:
+        design_checked.steps = [Step(key, pages[key]) for key in visited(ordered(pages), pages)]
+        design_checked.paths = {key: (*STEPS, key) for key in pages}
+    if checked.valid(("trial",)) and not design_checked.mistakes:
+        design_checked.steps = design.with_sections(design_checked, checked.trial)
+    for mistake in design_checked.mistakes:
         _note(checked, mistake.path, mistake.message)
 
 

@@ -85,8 +85,8 @@ def read_project(folder: Path) -> Config:
     if checked.valid(STEPS) and not file_mistakes:
         groups = number_of_groups(page.variants for page in (*steps, *game_pages))
         file_mistakes += sessions.mistakes_of_groups(checked, groups)
-    found = (*checked.mistakes, *file_mistakes, *source.parsed.mistakes)
-    mistakes = [source.diagnostic(mistake.path, mistake.message, line=mistake.line) for mistake in found]
+    all_mistakes = (*checked.mistakes, *file_mistakes, *source.parsed.mistakes)
+    mistakes = [source.diagnostic(mistake.path, mistake.message, line=mistake.line) for mistake in all_mistakes]
     agent = list(_agent_problems(source, others=bool(mistakes))) if any(step.type.on_server for step in steps) else []
     mistakes += [problem for problem in agent if not problem.remark]
     if mistakes:
@@ -170,15 +170,17 @@ def _step_files(folder: Path, checked: Checked) -> tuple[list[StepFiles], list[M
         pages_folder = open_folder(folder) if own else None
     except StepFileError as error:
         return [], [Mistake(STEPS, str(error))]
-    known = {step.key: step for step in checked.design.steps}
+    steps_by_key = {step.key: step for step in checked.design.steps}
     for key in visited(ordered(pages), pages):
         page = pages[key]
         try:
             variants, files = (
-                _files_of(pages_folder, page, checked, known.get(key)) if pages_folder and page in own else (0, ())
+                _files_of(pages_folder, page, checked, steps_by_key.get(key))
+                if pages_folder and page in own
+                else (0, ())
             )
             own_files = (CLOSING,) if page == CLOSING_PAGE else files
-            steps.append(StepFiles(key, page, variants, own_files, known.get(key)))
+            steps.append(StepFiles(key, page, variants, own_files, steps_by_key.get(key)))
         except StepFileError as error:
             mistakes.append(Mistake(checked.design.paths.get(key, (*STEPS, key)), str(error)))
     return steps, mistakes

@@ -84,7 +84,7 @@ def adapt(document: Mapping[str, Any], name: str = "") -> Adapted:
     rules: tuple[Callable[[Adapted], None], ...] = (
         _spellings,
         _generated,
-        lambda found: _id(found, name),
+        lambda tree: _id(tree, name),
         _live,
         _page_names,
         _steps,
@@ -133,9 +133,9 @@ def _id(adapted: Adapted, name: str) -> None:
     project, path = adapted.section(("project",)), ("project", "id")
     if "id" not in project:
         return
-    given = project["id"]
-    text = given.text if isinstance(given, Plain) and not isinstance(given.value, bool) else given
-    blank = is_blank(given)
+    id_given = project["id"]
+    text = id_given.text if isinstance(id_given, Plain) and not isinstance(id_given.value, bool) else id_given
+    blank = is_blank(id_given)
     if (not blank and not isinstance(text, str)) or ids.is_project_id(text):
         return
     # On AWS another project may have the folder's name as its id. HIPPO refuses an empty id, too.
@@ -224,10 +224,10 @@ def _renumber(adapted: Adapted, with_page: list[str], before: list[str]) -> None
     _put_steps(adapted, {now[key]: section[key] for key in with_page} | final, {now[key]: key for key in moved})
     events = adapted.section(("project", "events"))
     for event in ("startServerStep", "stopServerStep"):
-        named = number_in(events.get(event))
-        if named is None or str(named) not in before or now.get(str(named)) == str(named):
+        step_number = number_in(events.get(event))
+        if step_number is None or str(step_number) not in before or now.get(str(step_number)) == str(step_number):
             continue
-        events[event] = next((now[key] for key in with_page if int(key) >= named), FINAL)
+        events[event] = next((now[key] for key in with_page if int(key) >= step_number), FINAL)
 
 
 def _put_steps(adapted: Adapted, steps: dict[str, Any], origins: Mapping[str, str]) -> None:

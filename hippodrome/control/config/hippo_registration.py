@@ -34,8 +34,8 @@ def is_payload(event: Mapping[str, Any]) -> bool:
 
 def project_id(event: Mapping[str, Any]) -> str | None:
     """Return the id under which the payload is registered; None if its id cannot be used."""
-    found = adapt({"project": {"id": event.get("id")}, "trial": {}}).section(("project",)).get("id")
-    return found if ids.is_project_id(found) else None
+    id_found = adapt({"project": {"id": event.get("id")}, "trial": {}}).section(("project",)).get("id")
+    return id_found if ids.is_project_id(id_found) else None
 
 
 def differing_folder(event: Mapping[str, Any]) -> list[str]:
@@ -44,10 +44,10 @@ def differing_folder(event: Mapping[str, Any]) -> list[str]:
     The project's id here may differ from the one in the payload (`project_id`). The list is empty if they are the same,
     or if the payload's id cannot be used.
     """
-    given, here = event.get("id"), project_id(event)
-    if here is None or given == here:
+    id_given, here = event.get("id"), project_id(event)
+    if here is None or id_given == here:
         return []
-    return [f"project.id: the script uploads the pages to a folder {show(str(given))}; write {here} for both"]
+    return [f"project.id: the script uploads the pages to a folder {show(str(id_given))}; write {here} for both"]
 
 
 def differing_places(event: Mapping[str, Any], here: Mapping[str, str]) -> Iterator[str]:
@@ -60,9 +60,9 @@ def differing_places(event: Mapping[str, Any], here: Mapping[str, str]) -> Itera
     setup_values = dict(setup) if isinstance(setup, Mapping) else {}
     setup_values["bucket"] = setup_values.get("bucket") or event.get("bucket")
     for key, place in here.items():
-        named = setup_values.get(key)
-        if isinstance(named, str) and named and place and named.lower() != place.lower():
-            yield f"project.awsSetup.{key} is {named}, but this installation's is {place}"
+        place_named = setup_values.get(key)
+        if isinstance(place_named, str) and place_named and place and place_named.lower() != place.lower():
+            yield f"project.awsSetup.{key} is {place_named}, but this installation's is {place}"
 
 
 def lower_runtime(registration: dict[str, Any], most: int) -> list[str]:

@@ -63,9 +63,9 @@ def left_in_english(config: Config) -> Iterator[Remark]:
 
 def _left(own: Mapping[str, str], languages: Iterable[str], needed: Iterable[str]) -> Iterator[Remark]:
     """The remark on a study that names another language, and does not translate all texts that it needs."""
-    named = own.get(LANGUAGE)
-    foreign = [language for language in (named, *languages) if language and not _is_english(language)]
-    if not foreign or (named and _is_english(named)):
+    own_language = own.get(LANGUAGE)
+    foreign = [language for language in (own_language, *languages) if language and not _is_english(language)]
+    if not foreign or (own_language and _is_english(own_language)):
         return
     missing = [name for name in needed if name not in own or _is_untouched(name, own[name])]
     if missing:

@@ -122,15 +122,15 @@ class Lookups:
         looked = self._platform.run_all([partial(self._member, project, person) for person in waiting])
         by_label = {person.label: member for person, member in zip(waiting, looked, strict=True)}
         members, broken = {}, []
-        for each in proposals:
-            known = [by_label[label] for label in each.labels]
-            if any(isinstance(one, Exception) for one in known):
+        for proposed in proposals:
+            members_known = [by_label[label] for label in proposed.labels]
+            if any(isinstance(one, Exception) for one in members_known):
                 continue
-            able = [one for one in known if isinstance(one, Matched)]
-            if len(able) == len(known) and each.players == project.players:
-                members[each.id] = able
+            able = [one for one in members_known if isinstance(one, Matched)]
+            if len(able) == len(members_known) and proposed.players == project.players:
+                members[proposed.id] = able
             else:
-                broken.append(each.id)
+                broken.append(proposed.id)
         return members, broken
 
     def _member(self, project: Project, waiting: Waiting) -> Matched | Exception | None:

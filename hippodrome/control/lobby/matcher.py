@@ -52,7 +52,7 @@ class Matcher:
         free = rules.free(document, entries, now)
         labels = {person.label for person in free}
         chosen = [session for session in answer.sessions if labels.issuperset(session)] if answer else []
-        matched = {one for each in chosen for one in each}
+        matched = {label for labels_of_session in chosen for label in labels_of_session}
         new: Candidate | None = None
         if label in entries.waiting and label not in question.candidates() and not questions.is_full(question):
             new = candidate()

@@ -127,7 +127,7 @@ def next_question(
     candidates = {label: candidate for label, candidate in question.candidates().items() if label in waiting}
     next_asked = sorted(
         (person for person in free if person.label in candidates and person.label not in matched),
-        key=lambda one: one.order,
+        key=lambda person: person.order,
     )
     next_asked = next_asked[:MAX_WAITING]
     if not _is_due(question, project, {person.label for person in next_asked}, answered=answered, now=now):
@@ -135,12 +135,12 @@ def next_question(
     in_question = tuple(
         msgspec.structs.replace(candidates[person.label], waited=_waited(person, now)) for person in next_asked
     )
-    labels = {each.id for each in in_question}
+    labels = {candidate.id for candidate in in_question}
     rest = tuple(
         msgspec.structs.replace(candidate, waited=0) for label, candidate in candidates.items() if label not in labels
     )
-    made = Question(players=project.players, asked=now, waiting=in_question, came=rest)
-    return msgspec.structs.replace(made, id=hashlib.sha256(to_json(made)).hexdigest()[:20])
+    next_one = Question(players=project.players, asked=now, waiting=in_question, came=rest)
+    return msgspec.structs.replace(next_one, id=hashlib.sha256(to_json(next_one)).hexdigest()[:20])
 
 
 def _is_due(question: Question, project: Project, free: set[str], *, answered: bool, now: datetime) -> bool:

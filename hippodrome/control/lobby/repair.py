@@ -52,7 +52,7 @@ class Repair:
             self._store.finish_sessions(project)
         self._store.carry_out(project, rules.without_done(decisions, entries.done).for_good(), entries)
         ahead = [*decisions.open, *(session.waits_for for session in decisions.formed if session.waits_for)]
-        servers = {each.id: self._repository.server_of(project.id, each.id) for each in ahead}
+        servers = {session.id: self._repository.server_of(project.id, session.id) for session in ahead}
         entries = self._store.entries(project)  # again, for the marks of what was just carried out
         run = self._lookups.run(
             project, decisions, entries, rules.confirmed(decisions, entries), servers=StartedAhead(servers)
@@ -68,10 +68,10 @@ class Repair:
             if may_finish and document.renewed == decisions.renewed:
                 document = msgspec.structs.replace(document, renewed=None)
             document = servers_ahead.without_open(run.decided(document), ended)
-            wanted = servers_ahead.sessions_wanted(document, entries, project)
+            number_ahead = servers_ahead.sessions_wanted(document, entries, project)
             return servers_ahead.open_sessions(
                 document,
-                wanted,
+                number_ahead,
                 "",
                 run.now,
                 ids.new_session_id,
@@ -84,11 +84,15 @@ class Repair:
         for session_id in sorted(ended - after.session_ids()):
             self._platform.bus.publish(Topic.STOP, to_message(StopServer(project.id, session_id)))
         waits_for = (session.waits_for for session in after.formed if session.waits_for)
-        for each in [*after.open, *waits_for]:
-            is_new = each.by == "" and each.requested == run.now
-            is_lost = each.id in servers and servers[each.id] is None and run.now - each.requested > NO_RECORD_AFTER
+        for open_session in [*after.open, *waits_for]:
+            is_new = open_session.by == "" and open_session.requested == run.now
+            is_lost = (
+                open_session.id in servers
+                and servers[open_session.id] is None
+                and run.now - open_session.requested > NO_RECORD_AFTER
+            )
             if is_new or is_lost:
-                self._store.start_server(project, each.id, each.players)
+                self._store.start_server(project, open_session.id, open_session.players)
         formed = tuple(session for session in after.for_good().formed if session not in decisions.formed)
         self._store.carry_out(project, Decisions(formed=formed), entries)
         if ended:

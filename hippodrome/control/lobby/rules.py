@@ -56,7 +56,7 @@ def free(document: Decisions, entries: Entries, now: datetime) -> list[Waiting]:
     """Return the participants who are present and in no session, in the order of arrival."""
     busy = document.labels()
     present = (person for person in entries.waiting.values() if person.label not in busy and person.is_present(now))
-    return sorted(present, key=lambda one: one.order)
+    return sorted(present, key=lambda person: person.order)
 
 
 def confirmed(document: Decisions, entries: Entries) -> list[Proposal]:
@@ -154,14 +154,21 @@ def form(
 
     `seats` says which member plays which player (`project.seats`).
     """
-    found = next((proposal for proposal in document.proposed if proposal.id == proposal_id), None)
-    if found is None or found.labels != tuple(member.label for member in members):
+    proposal_found = next((proposal for proposal in document.proposed if proposal.id == proposal_id), None)
+    if proposal_found is None or proposal_found.labels != tuple(member.label for member in members):
         return document
-    seated = _seated(members, found.session_id, seats)
-    formed = Formed(found.session_id, seated, now, found.ahead is not None, found.ahead, found.players)
+    seated = _seated(members, proposal_found.session_id, seats)
+    formed = Formed(
+        proposal_found.session_id,
+        seated,
+        now,
+        proposal_found.ahead is not None,
+        proposal_found.ahead,
+        proposal_found.players,
+    )
     return msgspec.structs.replace(
         document,
-        proposed=tuple(proposal for proposal in document.proposed if proposal is not found),
+        proposed=tuple(proposal for proposal in document.proposed if proposal is not proposal_found),
         formed=(*document.formed, formed),
     )
 
@@ -223,7 +230,7 @@ def without(document: Decisions, label: str) -> Decisions:
     others = without_proposals(document, [proposal.id for proposal in document.proposed if label in proposal.labels])
     return msgspec.structs.replace(
         others,
-        open=tuple(found for server in others.open if (found := unnamed(server))),
+        open=tuple(unnamed_server for server in others.open if (unnamed_server := unnamed(server))),
         proposed=tuple(
             msgspec.structs.replace(proposal, ahead=unnamed(proposal.ahead)) for proposal in others.proposed
         ),

@@ -29,7 +29,7 @@ class StartedAhead:
     def over(self) -> frozenset[str]:
         """The ids of sessions whose servers have ended and are not replaced."""
         closed = ((name, record) for name, record in self.records.items() if record and record.is_closed)
-        return frozenset(name for name, each in closed if next_attempt(each) is None)
+        return frozenset(name for name, record in closed if next_attempt(record) is None)
 
     @property
     def coming(self) -> frozenset[str]:

@@ -173,10 +173,10 @@ class LobbyStore:
         """Write the participant's membership and return it. An earlier membership stays, and is returned instead."""
         if self._create(membership_key(project.id, user_id), to_json(membership)):
             return membership
-        found = self._repository.membership(project.id, user_id)
-        if found is not None and found != membership:
+        earlier = self._repository.membership(project.id, user_id)
+        if earlier is not None and earlier != membership:
             logger.error("a participant has another membership already", extra={"project": project.id})
-        return found or membership
+        return earlier or membership
 
     def _create(self, key: str, body: bytes) -> bool:
         """Create a document; return False if there is one already."""

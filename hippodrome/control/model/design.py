@@ -191,9 +191,9 @@ def own_steps(steps: Sequence[Step], blocks: Sequence[Block], assignment: Assign
             path += members if assignment is None else [_at(step, assignment.condition) for step in members]
             continue
         block = blocks[number]
-        known = set(block.runs)
+        runs_of_block = set(block.runs)
         order = assignment.orders.get(block.name) if assignment else None
-        runs = block.runs if order is None else [run for run in map(tuple, order) if run in known]
+        runs = block.runs if order is None else [run for run in map(tuple, order) if run in runs_of_block]
         for position, run in enumerate(runs[: block.length], 1):
             path += _runs(members, block.levels(run), position, assignment)
     return path

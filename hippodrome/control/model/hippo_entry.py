@@ -97,8 +97,8 @@ def _place(event: object, steps: Mapping[str, Any], keys: list[str]) -> int | No
     if not re.fullmatch(r"[1-9][0-9]{0,2}", text):
         return None
     before = sum(_is_blank(steps[str(number)]) for number in numbers if number < int(text))
-    found = position(str(int(text) - before), keys)
-    return len(keys) - 1 if found is None else found
+    place = position(str(int(text) - before), keys)
+    return len(keys) - 1 if place is None else place
 
 
 def _page(page: object) -> str:

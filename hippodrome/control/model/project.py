@@ -311,9 +311,9 @@ class MasterList(Record, frozen=True):
 
     def salt(self, project_id: str) -> str | None:
         """Return the project's salt, also from an entry that cannot be read; None if the project has no entry."""
-        found = self.find(project_id)
-        if found:
-            return found.salt
+        project = self.find(project_id)
+        if project:
+            return project.salt
         entries = (_as_object(entry.raw) for entry in self.unreadable if entry.id == project_id)
         return next((_string(entry, "salt") for entry in entries), None)
 

@@ -53,7 +53,7 @@ class BadRule(ValueError):
 
 def mentioned(rule: str) -> set[tuple[str, ...]]:
     """Return the names that a rule asks about, such as ("answers", "consent", "agree"). Raises `BadRule`."""
-    found: set[tuple[str, ...]] = set()
+    mentions: set[tuple[str, ...]] = set()
     nodes: list[ast.AST] = [_tree(rule)]
     while nodes:
         node = nodes.pop()
@@ -61,8 +61,8 @@ def mentioned(rule: str) -> set[tuple[str, ...]]:
         if names is None:
             nodes += ast.iter_child_nodes(node)
         else:
-            found.add(names)
-    return found
+            mentions.add(names)
+    return mentions
 
 
 def constants(rule: str) -> list[Any]:

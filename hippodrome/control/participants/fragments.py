@@ -158,13 +158,13 @@ class _Preparation:
 
     def _link(self, attributes: str) -> str:
         """The attributes of a link. Only a link to a file is changed: `next?…`, for one, is an address of ours."""
-        given = _attributes(attributes)
-        relocated = self._relocate(given.get("href", ""))
+        values = _attributes(attributes)
+        relocated = self._relocate(values.get("href", ""))
         if not relocated.startswith(self._base) or not is_served(re.split(r"[?#]", relocated, maxsplit=1)[0]):
             return attributes
         attributes = _ATTRIBUTE.sub(lambda attribute: self._relocated(attribute, "href"), attributes)
         return (
-            attributes if "target" in given or "download" in given else f' target="_blank" rel="noopener"{attributes}'
+            attributes if "target" in values or "download" in values else f' target="_blank" rel="noopener"{attributes}'
         )
 
     def _relocated(self, match: re.Match[str], *names: str) -> str:

@@ -162,9 +162,9 @@ def _answer(status: int, text: str) -> Response:
 
 def _delay(answers: Mapping[str, Any]) -> int:
     """The field `delay`, in seconds; 0 without it. Raises `Refusal`."""
-    given = answers.get("delay", 0)
+    delay_given = answers.get("delay", 0)
     try:
-        delay = int(given) if not isinstance(given, bool) else -1
+        delay = int(delay_given) if not isinstance(delay_given, bool) else -1
     except (TypeError, ValueError, OverflowError):
         delay = -1
     if not 0 <= delay <= MAX_DELAY:

@@ -70,7 +70,9 @@ def _answers(parsed: Any) -> set[str]:
             key = node.attr if isinstance(node, nodes.Getattr) else getattr(node.arg, "value", None)
             if isinstance(key, str):
                 steps.add((id(node.node), key))
-    whole = {id(node) for node in parsed.find_all(nodes.Name) if node.name == "answers"} - {one for one, _ in steps}
+    whole = {id(node) for node in parsed.find_all(nodes.Name) if node.name == "answers"} - {
+        name_node for name_node, _ in steps
+    }
     return {"answers"} if whole else {f"answers.{key}" for _, key in steps}
 
 

@@ -55,9 +55,9 @@ class Calls:
         Raises what the researcher's code raises, and Diverged if a replay differs from the recording.
         """
         if isinstance(call, StepCall):
-            taken = self._step(call)
+            step = self._step(call)
             self._stepped()
-            return taken
+            return step
         if isinstance(call, FeedbackCall):
             return self._end(call)
         if isinstance(call, ResetCall):

@@ -259,7 +259,7 @@ class JointAdapter:
         self, observations: Mapping[str, Any], infos: Mapping[str, Mapping[str, Any]]
     ) -> dict[str, tuple[bool, ...]]:
         """Return the `action_mask` of each player in the game, from their info, else from their observation (a map)."""
-        found = {}
+        masks = {}
         for player in self.players:
             if player in self._ended:
                 continue
@@ -279,8 +279,8 @@ class JointAdapter:
                 if len(legal) != count:
                     raise AgentError(f"{ACTION_MASK} of {player} has {len(legal)} values; there are {count} actions")
                 if any(legal):  # all zeros is no mask: PettingZoo gives it to a player who is not to act
-                    found[player] = legal
-        return found
+                    masks[player] = legal
+        return masks
 
 
 def _info(value: Any) -> Mapping[str, Any]:

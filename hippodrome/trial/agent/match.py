@@ -42,7 +42,7 @@ def groups(function: Callable[..., Any], question: Mapping[str, Any]) -> tuple[l
     BadGroups if it returned anything else, and what `match` raises.
     """
     waiting, players = candidates(question), question["players"]
-    waiting_ids = {each["id"] for each in waiting}
+    waiting_ids = {person["id"] for person in waiting}
     more = {"players": players} if signatures.names(function, "players") else {}
     returned = function(waiting, **more)
     if returned is None or isinstance(returned, str | bytes | Mapping) or not isinstance(returned, Iterable):
@@ -67,13 +67,13 @@ def _ids(group: Any) -> list[str] | None:
     """Return the ids of a group; None if it is no list of ids or candidates."""
     if isinstance(group, str | bytes | Mapping) or not isinstance(group, Iterable):
         return None
-    found: list[str] = []
+    ids: list[str] = []
     for each in group:
         name = each.get("id") if isinstance(each, Mapping) else each
         if not isinstance(name, str):
             return None
-        found.append(name)
-    return found
+        ids.append(name)
+    return ids
 
 
 def _fault(ids: list[str], players: int, waiting_ids: set[str], taken: set[str]) -> str:

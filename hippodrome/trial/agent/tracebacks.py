@@ -49,12 +49,12 @@ def _own_path(path: Path, folder: Path) -> str | None:
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
     """Yield the error and the errors that led to it, the latest first."""
-    each: BaseException | None = error
+    cause: BaseException | None = error
     for _ in range(_MAX_CHAIN):
-        if each is None:
+        if cause is None:
             return
-        yield each
-        each = each.__cause__ or (None if each.__suppress_context__ else each.__context__)
+        yield cause
+        cause = cause.__cause__ or (None if cause.__suppress_context__ else cause.__context__)
 
 
 def without(private: Iterable[str], text: str) -> str:

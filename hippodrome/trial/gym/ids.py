@@ -44,11 +44,11 @@ def has_version(env_id: str) -> bool:
     return _ID.fullmatch(env_id) is not None
 
 
-def _newest(env_id: str, known: list[str]) -> str:
+def _newest(env_id: str, env_ids: list[str]) -> str:
     """Return the newest version of the environment among the `known` ids; `env_id` itself if there is no newer one."""
-    given = _ID.fullmatch(env_id)
-    if given is None:
+    wanted_id = _ID.fullmatch(env_id)
+    if wanted_id is None:
         return env_id
-    same = [match for key in known if (match := _ID.fullmatch(key)) and match["name"] == given["name"]]
-    newest = max(same, key=lambda match: int(match["version"]), default=given)
-    return newest[0] if int(newest["version"]) > int(given["version"]) else env_id
+    same = [match for key in env_ids if (match := _ID.fullmatch(key)) and match["name"] == wanted_id["name"]]
+    newest = max(same, key=lambda match: int(match["version"]), default=wanted_id)
+    return newest[0] if int(newest["version"]) > int(wanted_id["version"]) else env_id

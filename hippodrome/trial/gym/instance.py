@@ -64,8 +64,8 @@ class Instance:
         if seed is not None and not _reset_takes_seed(self.env):
             self.env.seed(seed)
             seed = None
-        named = {name: value for name, value in (("seed", seed), ("options", options)) if value is not None}
-        result = self.env.reset(**named)
+        keywords = {name: value for name, value in (("seed", seed), ("options", options)) if value is not None}
+        result = self.env.reset(**keywords)
         if isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict):
             return result
         return result, {}  # an environment of gym's old kind returns the observation alone

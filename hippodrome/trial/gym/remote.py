@@ -48,17 +48,17 @@ class RemoteEnv(gymnasium.Env[Any, Any]):
         self._client = client = GymClient(url, ca=ca, timeout=timeout)
         self._closer = weakref.finalize(self, client.close)
         try:
-            made = client.call("make", env_id=env_id, **params)
+            facts = client.call("make", env_id=env_id, **params)
             try:
-                self._id = made["instance_id"]
-                self.observation_space = spaces.build(made["observation_space"])
-                self.action_space = spaces.build(made["action_space"])
-                self.render_mode = made["render_mode"]
+                self._id = facts["instance_id"]
+                self.observation_space = spaces.build(facts["observation_space"])
+                self.action_space = spaces.build(facts["action_space"])
+                self.render_mode = facts["render_mode"]
                 # The mode human would open a window on the server.
-                modes = [mode for mode in made["metadata"].get("render_modes") or [] if mode != "human"]
-                self.metadata = {**made["metadata"], "render_modes": modes}
+                modes = [mode for mode in facts["metadata"].get("render_modes") or [] if mode != "human"]
+                self.metadata = {**facts["metadata"], "render_modes": modes}
                 kwargs = {"url": url, "env_id": env_id, "ca": ca, "timeout": timeout, **params}
-                self.spec = EnvSpec(env_id, entry_point="hippodrome.gym:RemoteEnv", kwargs=kwargs, **made["spec"])
+                self.spec = EnvSpec(env_id, entry_point="hippodrome.gym:RemoteEnv", kwargs=kwargs, **facts["spec"])
             except (KeyError, TypeError, ValueError, AttributeError) as error:
                 client.unfit(error)
         except BaseException:

@@ -181,13 +181,13 @@ class GymSession:
 def _description(env: Any) -> dict[str, Any]:
     """Describe an environment for RemoteEnv. Raises CodecError."""
     spec = getattr(env, "spec", None)
-    named = ("max_episode_steps", "reward_threshold", "nondeterministic")
+    attributes = ("max_episode_steps", "reward_threshold", "nondeterministic")
     return {
         "observation_space": spaces.describe(env.observation_space),
         "action_space": spaces.describe(env.action_space),
         "render_mode": getattr(env, "render_mode", None),
         "metadata": dict(getattr(env, "metadata", None) or {}),
-        "spec": {} if spec is None else {name: getattr(spec, name) for name in named},
+        "spec": {} if spec is None else {name: getattr(spec, name) for name in attributes},
     }
 
 

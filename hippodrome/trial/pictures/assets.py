@@ -79,7 +79,7 @@ class Assets:
 
     def table(self) -> list[dict[str, Any]]:
         """Return the images' table for a client, which asks for the images whose hashes it does not have."""
-        return [{"name": each.name, "bytes": len(each.packed), "hash": each.hash} for each in self.by_name.values()]
+        return [{"name": asset.name, "bytes": len(asset.packed), "hash": asset.hash} for asset in self.by_name.values()]
 
 
 def load(project: Path, folder: str) -> Assets:
@@ -230,14 +230,14 @@ def _listed(value: Mapping[str, Any], size: tuple[int, int]) -> Iterator[tuple[s
     if isinstance(frames, dict):
         pairs = list(frames.items())
     elif isinstance(frames, list):
-        pairs = [(each.get("filename") if isinstance(each, dict) else None, each) for each in frames]
+        pairs = [(frame.get("filename") if isinstance(frame, dict) else None, frame) for frame in frames]
     else:
         raise AssetError("has no frames")
-    for name, each in pairs[: MAX_FRAMES + 1]:
-        box = each.get("frame") if isinstance(each, dict) else None
+    for name, frame_entry in pairs[: MAX_FRAMES + 1]:
+        box = frame_entry.get("frame") if isinstance(frame_entry, dict) else None
         if not isinstance(name, str) or not isinstance(box, dict):
             raise AssetError("has a frame without a name, or without a box (x, y, w, h) as its `frame`")
-        if each.get("rotated"):
+        if frame_entry.get("rotated"):
             raise AssetError(f"has the frame {name[:40]!r} turned; pack it without rotation")
         left, top, width, height = (box[key] if _is_whole(box.get(key), 0) else -1 for key in ("x", "y", "w", "h"))
         if not (_inside(left, width, size[0]) and _inside(top, height, size[1])):

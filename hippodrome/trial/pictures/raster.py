@@ -39,8 +39,8 @@ class Raster:
         """Draw the scene. Return it as a frame of RGB values."""
         with self._lock:
             canvas = Image.new("RGB", self._size, self._background)
-            for each in sorted(scene.objects.values(), key=lambda each: float(each.get("depth", 0))):
-                self._object(canvas, each)
+            for scene_object in sorted(scene.objects.values(), key=lambda drawn: float(drawn.get("depth", 0))):
+                self._object(canvas, scene_object)
             return np.array(canvas, dtype=np.uint8)
 
     def _object(self, canvas: Image.Image, checked_object: CheckedObject) -> None:

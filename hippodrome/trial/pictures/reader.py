@@ -64,7 +64,7 @@ class PictureReader:
         self._images[view] = images
         assert self._section is not None
         for name in sorted(images - self._assets.by_name.keys()):
-            shown = next(key for key, each in scene.objects.items() if each.get("image") == name)
+            shown = next(key for key, scene_object in scene.objects.items() if scene_object.get("image") == name)
             self._tell_once(
                 f"render(): the object {shown!r} shows the image {name!r}, which is not in {self._section.assets}/"
             )

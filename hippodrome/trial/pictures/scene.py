@@ -73,11 +73,11 @@ def as_scene(value: Any, before: Scene | None = None) -> Scene:
     `before` is the scene before it in the same episode: its permanent objects stay. An object that did not change is
     the same Python object in both scenes. Raises SceneError if `value` has neither form or more than MAX_OBJECTS.
     """
-    given, hud = _parts(value)
-    if before is not None and (scene := _changed_in_place(before, given, hud)) is not None:
+    objects_given, hud = _parts(value)
+    if before is not None and (scene := _changed_in_place(before, objects_given, hud)) is not None:
         return scene
     builder = _SceneBuilder(before or Scene({}))
-    builder.add_all(given)
+    builder.add_all(objects_given)
     return builder.scene(hud)
 
 
@@ -93,19 +93,19 @@ def _changed_in_place(before: Scene, values: Sequence[Any], hud: str) -> Scene |
         changed = list(compress(count(), map(ne, before.given.values(), values)))
     except Exception:  # noqa: BLE001 - the researcher's values may raise anything; `_SceneBuilder` reports it
         return None
-    objects, given, images, letters = dict(before.objects), dict(before.given), before.images, before.letters
+    objects, given_before, images, letters = dict(before.objects), dict(before.given), before.images, before.letters
     for index in changed:
         name = names[index]
         earlier, value = objects[name], values[index]
-        checked = checked_again(earlier, given[name], value)
+        checked = checked_again(earlier, given_before[name], value)
         if checked is None:
             return None
-        objects[name], given[name] = checked, dict(value)
+        objects[name], given_before[name] = checked, dict(value)
         if earlier.get("image") != checked.get("image"):
             images = _images(objects)
         if "text" in checked and (letters := letters + len(checked["text"]) - len(earlier["text"])) > MAX_TEXT_IN_ALL:
             return None
-    return Scene(objects, hud, before.permanent, (), given, images, letters)
+    return Scene(objects, hud, before.permanent, (), given_before, images, letters)
 
 
 class _SceneBuilder:
@@ -114,29 +114,33 @@ class _SceneBuilder:
     def __init__(self, before: Scene) -> None:
         self._before = before
         self._permanent = permanent = set(before.permanent)
-        self._objects = {name: each for name, each in before.objects.items() if name in permanent} if permanent else {}
+        self._objects = (
+            {name: scene_object for name, scene_object in before.objects.items() if name in permanent}
+            if permanent
+            else {}
+        )
         self._not_returned = set(self._objects)
         """The permanent objects of `before` that `render()` has not returned again so far."""
         self._given: dict[str, Mapping[str, Any]] = {}
         self._problems: list[str] = []
-        self._points = sum(len(each.get("points", ())) for each in self._objects.values())
+        self._points = sum(len(scene_object.get("points", ())) for scene_object in self._objects.values())
         self._new_letters = 0  # characters of texts that have changed
 
     def add_all(self, values: Sequence[Any]) -> None:
         """Add, change or remove objects. Most objects are as in the scene before, so these take the shortest way."""
-        objects, before, known = self._objects, self._before.objects, self._before.given
+        objects, before, given_before = self._objects, self._before.objects, self._before.given
         not_permanent = before.keys() - self._before.permanent  # permanent objects need `_put`
         room = len(objects) + len(values) <= MAX_OBJECTS
         for index, value in enumerate(values):
             name = value.get("id") if room and type(value) is dict else None
             if type(name) is str and name in not_permanent and name not in objects:
                 try:
-                    same = known.get(name) == value
+                    same = given_before.get(name) == value
                 except Exception:  # noqa: BLE001 - the researcher's values may raise anything; `_add` reports it
                     same = False
                 if same:
                     objects[name] = before[name]
-                    self._given[name] = known[name]
+                    self._given[name] = given_before[name]
                     continue
             self._add(value, index)
 
@@ -144,13 +148,13 @@ class _SceneBuilder:
         """Add, change or remove one object."""
         problems_before = len(self._problems)
         try:
-            given = mapping_of(value)
-            name = self._unchanged(given)
+            mapping = mapping_of(value)
+            name = self._unchanged(mapping)
             if name is not None:
-                self._put(name, self._before.objects[name], given)
+                self._put(name, self._before.objects[name], mapping)
                 self._given[name] = self._before.given[name]
                 return
-            name, fields = fields_of(given, index, self._problems)
+            name, fields = fields_of(mapping, index, self._problems)
             self._given.pop(name, None)
             if fields.get("remove"):
                 self._points -= len(self._objects.pop(name, {}).get("points", ()))
@@ -173,8 +177,8 @@ class _SceneBuilder:
         earlier = self._before.objects.get(name)
         self._put(name, earlier if earlier is not None and earlier == checked else checked, fields)
         # An object with values that may change in place, or with a problem, is checked again each time.
-        if problems_before == len(self._problems) and _SCALARS.issuperset(map(type, given.values())):
-            self._given[name] = dict(given)
+        if problems_before == len(self._problems) and _SCALARS.issuperset(map(type, mapping.values())):
+            self._given[name] = dict(mapping)
 
     def _has_room(self, text: Any) -> bool:
         """Count this text if the scene has room for it; return whether it has.
@@ -190,13 +194,13 @@ class _SceneBuilder:
         self._new_letters += letters
         return True
 
-    def _unchanged(self, given: Mapping[str, Any]) -> str | None:
+    def _unchanged(self, mapping: Mapping[str, Any]) -> str | None:
         """Return the object's id if the scene before has it with the same values; else None."""
-        name = given.get("id") or given.get("uuid")
+        name = mapping.get("id") or mapping.get("uuid")
         if type(name) is not str or name not in self._before.objects:
             return None
         try:
-            return name if self._before.given.get(name) == given else None
+            return name if self._before.given.get(name) == mapping else None
         except ValueError:  # NumPy's arrays do not compare to True or False
             return None
 
@@ -219,8 +223,8 @@ class _SceneBuilder:
         """Return a scene of the objects so far. Permanent ones come first, as they will in later scenes."""
         objects, permanent = self._objects, self._permanent
         if permanent:
-            first = {name: each for name, each in objects.items() if name in permanent}
-            objects = first | {name: each for name, each in objects.items() if name not in permanent}
+            first = {name: scene_object for name, scene_object in objects.items() if name in permanent}
+            objects = first | {name: scene_object for name, scene_object in objects.items() if name not in permanent}
         letters = self._before.letters + self._new_letters
         if letters > MAX_TEXT_IN_ALL:
             objects, letters = self._with_few_letters(objects)
@@ -235,14 +239,14 @@ class _SceneBuilder:
         """
         fitting: dict[str, CheckedObject] = {}
         letters = 0
-        for name, each in objects.items():
-            text = each.get("text", "")
+        for name, scene_object in objects.items():
+            text = scene_object.get("text", "")
             if letters + len(text) > MAX_TEXT_IN_ALL:
                 self._problems.append(_TOO_MUCH_TEXT)
                 self._given.pop(name, None)
                 continue
             letters += len(text)
-            fitting[name] = each
+            fitting[name] = scene_object
         return fitting, letters
 
 
@@ -257,7 +261,7 @@ def images_of(scene: Scene) -> frozenset[str]:
 
 
 def _images(objects: Mapping[str, CheckedObject]) -> frozenset[str]:
-    return frozenset(each["image"] for each in objects.values() if each["type"] == "sprite")
+    return frozenset(scene_object["image"] for scene_object in objects.values() if scene_object["type"] == "sprite")
 
 
 def _parts(value: Any) -> tuple[Sequence[Any], str]:

@@ -87,14 +87,14 @@ def changes(before: Scene | None, scene: Scene) -> dict[str, Any]:
     in_place = list(known) == list(objects)
     # `compress` finds the few changed objects. A loop over all would take longer than the rest of this function.
     maybe = compress(objects.items(), map(is_not, known.values(), objects.values())) if in_place else objects.items()
-    for name, each in maybe:
+    for name, scene_object in maybe:
         earlier = known.get(name)
-        if earlier is each:
+        if earlier is scene_object:
             continue
-        if earlier is None or earlier["type"] != each["type"]:
-            changed[name] = each
+        if earlier is None or earlier["type"] != scene_object["type"]:
+            changed[name] = scene_object
         else:
-            changed[name] = _fields(earlier, each)
+            changed[name] = _fields(earlier, scene_object)
     if changed:
         message["set"] = changed
     if not in_place:

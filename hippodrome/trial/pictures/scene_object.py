@@ -75,7 +75,11 @@ def fields_of(value: Any, index: int, problems: list[str]) -> tuple[str, dict[st
     An object without a usable id gets one by its `index`, such as `#1`, and a sentence in `problems`. Raises
     UnusableValue if the object has no fields.
     """
-    fields = {_OTHER_NAMES.get(key, key): each for key, each in mapping_of(value).items() if each is not None}
+    fields = {
+        _OTHER_NAMES.get(key, key): value_of_key
+        for key, value_of_key in mapping_of(value).items()
+        if value_of_key is not None
+    }
     name = fields.pop("id", None)
     if isinstance(name, int | np.integer) and not isinstance(name, bool):
         name = str(name)
@@ -128,23 +132,23 @@ def checked_object(fields: Mapping[str, Any], name: str, problems: list[str]) ->
     return checked
 
 
-def checked_again(earlier: CheckedObject, given: Mapping[str, Any], value: Mapping[str, Any]) -> CheckedObject | None:
+def checked_again(earlier: CheckedObject, mapping: Mapping[str, Any], value: Mapping[str, Any]) -> CheckedObject | None:
     """Return a checked object with new values of some fields, and check only these.
 
     `earlier` is the checked object, made of `given`; `value` is what `render()` returned now. Returns None if the whole
     object must be checked again.
     """
-    if list(given) != list(value) or list(map(type, given.values())) != list(map(type, value.values())):
+    if list(mapping) != list(value) or list(map(type, mapping.values())) != list(map(type, value.values())):
         return None
     if not _OTHER_NAMES.keys().isdisjoint(value):  # both names of one field may be there
         return None
     table, fields = TYPES[earlier["type"]], {}
-    for key, each in value.items() - given.items():
+    for key, new_value in value.items() - mapping.items():
         if key not in earlier or key not in table:  # the field had its default, or its value concerns other fields
             return None
         check, default = table[key]
         try:
-            fields[key] = check(each)
+            fields[key] = check(new_value)
         except UnusableValue:
             return None
         if fields[key] == default:

@@ -51,13 +51,13 @@ class Spool:
 
         Those in which nothing was written are deleted.
         """
-        left = []
+        leftovers = []
         for path in sorted((self.folder / prefix).glob("*.jsonl.gz.part")):
             if path.stat().st_size == 0:  # the disk was full, or the process was killed in its first half second
                 path.unlink()
             else:
-                left.append((f"{prefix}/{path.name.removesuffix('.part')}", path))
-        return left
+                leftovers.append((f"{prefix}/{path.name.removesuffix('.part')}", path))
+        return leftovers
 
 
 async def store_file(store: Store, key: str, path: Path) -> None:

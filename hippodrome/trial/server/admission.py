@@ -105,15 +105,17 @@ class Admission:
         """
         settings = self._settings()
         steps = settings.game_steps
-        earlier = [each for each in steps[: steps.index(step)] if each not in self._finished_steps]
-        for key in (answer_key(settings.project_id, user_id, each) for each in earlier):
+        earlier = [
+            earlier_step for earlier_step in steps[: steps.index(step)] if earlier_step not in self._finished_steps
+        ]
+        for key in (answer_key(settings.project_id, user_id, earlier_step) for earlier_step in earlier):
             try:
                 async with asyncio.timeout(settings.hello_seconds):
-                    found = await asyncio.to_thread(self._store.get, key)
+                    document = await asyncio.to_thread(self._store.get, key)
             except Exception as error:
                 log.warning("cannot look for an earlier answer (%s)", short_error(error))
                 raise CloseConnection(1013, NOT_ASSIGNED) from error
-            if found is None:
+            if document is None:
                 raise CloseConnection(4404, "an earlier game step is not over for you")
 
 

@@ -78,8 +78,8 @@ class Search:
         while not self._settings.assigned:
             looked, self._looked = self._looked, asyncio.Event()  # a `look` from here on waits for the next pass
             self._asked.clear()
-            while not self._settings.assigned and (found := await self._find()) is not None:
-                self._settings, document = found
+            while not self._settings.assigned and (assignment_found := await self._find()) is not None:
+                self._settings, document = assignment_found
                 await assign(self._settings, document)
             looked.set()
             if self._settings.assigned:

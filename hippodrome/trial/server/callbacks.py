@@ -68,8 +68,8 @@ class TrialCallbacks:
         end of this work are counted, and `write_lines` writes only these.
         """
 
-        def finished(found: tuple[Any, int] | None, error: Exception | None) -> None:
-            result, self._recorded = found or (None, self._recorded_now())
+        def finished(outcome: tuple[Any, int] | None, error: Exception | None) -> None:
+            result, self._recorded = outcome or (None, self._recorded_now())
             done(result, error)
 
         self._worker.submit(lambda: (work(), self._recorded_now()), limit, finished)
