@@ -9,7 +9,6 @@ from testing.simulation import faults
 from testing.simulation.faults import SimulatedJourney
 from testing.simulation.world import SimulatedWorld
 
-
 MANY = 5_000  # points; a journey of a day has more, mostly in the sweeps of a night
 
 
