@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import resource
+from collections.abc import Iterable
 from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -11,6 +12,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 HEADER_SECONDS = 10.0  # from the connection, or the last response, until the headers of a request have come
 REQUEST_SECONDS = 60.0  # from the headers of a request until its body has come and its response is sent
 MAX_CONNECTIONS = 512  # connections at once
+ADDRESS_CONNECTIONS = 64  # connections at once for pages from one address of another machine
+LOOPBACK = "127."  # here all clients of this machine, such as bots and a proxy, have one address
 SHARE = 4  # of the files that this process may open, at most one in so many is a connection
 
 
@@ -26,8 +29,9 @@ def most() -> int:
 class HttpConnection(H11Protocol):
     """uvicorn's connection, which is closed when its client is too slow.
 
-    If there are more connections than `most` allows, this closes the connection that has waited longest for a request;
-    if all others have a request that is being answered, it closes the newest.
+    If there are more connections than `most` allows, or more than ADDRESS_CONNECTIONS from one other machine, this
+    closes the one of them that has waited longest for a whole request; if all others have a request that is being
+    answered, it closes the newest.
     """
 
     _timer: asyncio.TimerHandle | None = None
@@ -36,15 +40,12 @@ class HttpConnection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self._arm(HEADER_SECONDS)
+        others = [connection for connection in self.connections if isinstance(connection, HttpConnection)]
+        same = [connection for connection in others if connection.address == self.address]
         if len(self.connections) > most():
-            waiting = [
-                connection
-                for connection in self.connections
-                if isinstance(connection, HttpConnection) and not connection.answering
-            ]
-            oldest = min(waiting, key=lambda person: person._since)  # `waiting` has at least this connection
-            self.connections.discard(oldest)  # `connection_lost` is called only later
-            oldest.transport.abort()
+            _close_oldest(others)
+        elif len(same) > ADDRESS_CONNECTIONS and not self.address.startswith(LOOPBACK):
+            _close_oldest(same)
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._timer is not None:
@@ -52,9 +53,9 @@ class HttpConnection(H11Protocol):
         super().connection_lost(exc)
 
     def handle_events(self) -> None:
-        before = self.answering
+        before = self.cycle
         super().handle_events()
-        if self.answering and not before:
+        if self.cycle is not before:
             self._arm(REQUEST_SECONDS)
 
     def handle_websocket_upgrade(self, event: Any) -> None:
@@ -67,13 +68,30 @@ class HttpConnection(H11Protocol):
         super().on_response_complete()
 
     @property
-    def answering(self) -> bool:
-        """Whether a request's headers have come and its answer has not been sent to the end."""
+    def address(self) -> str:
+        """The client's IPv4 address."""
+        return self.client[0] if self.client else ""
+
+    @property
+    def waits(self) -> bool:
+        """Whether no request has come with its whole body since the last answer was sent."""
         cycle: Any = self.cycle
-        return cycle is not None and not cycle.response_complete
+        return cycle is None or cycle.response_complete or cycle.more_body
+
+    @property
+    def since(self) -> float:
+        """When it was made, or got the headers of its last request, or sent its last answer."""
+        return self._since
 
     def _arm(self, seconds: float) -> None:
         if self._timer is not None:
             self._timer.cancel()
         self._since = self.loop.time()
         self._timer = self.loop.call_later(seconds, self.transport.abort)
+
+
+def _close_oldest(crowd: Iterable[HttpConnection]) -> None:
+    """Close the connection that waits longest. At least one of the crowd must wait, as the newest does."""
+    oldest = min((connection for connection in crowd if connection.waits), key=lambda connection: connection.since)
+    oldest.connections.discard(oldest)  # `connection_lost` is called only later
+    oldest.transport.abort()

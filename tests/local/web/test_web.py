@@ -15,8 +15,10 @@ import httpx
 import pytest
 
 from hippodrome.control.http import Request
+from hippodrome.control.participants import forms
 from hippodrome.local.web import access, connections, server
 from hippodrome.local.web import app as web_app
+from testing.waiting import until
 
 Event = dict[str, Any]
 
@@ -190,11 +192,20 @@ def test_the_error_of_a_function_is_printed_and_not_sent_to_the_participant(
     assert "Traceback" in site.said[0]
 
 
-def test_bodies_may_have_ten_megabytes(site: Site) -> None:
+def test_a_body_that_no_function_takes_is_refused(site: Site) -> None:
+    assert forms.MAX_BODY < web_app.MAX_BODY, "a function must be able to say that a form is too long"
     assert site.http.post("/next", content=b"x" * web_app.MAX_BODY).status_code == 200
     site.events.clear()
-    assert site.http.post("/next", content=b"x" * (web_app.MAX_BODY + 1)).status_code == 413
+    too_long = b"x" * (web_app.MAX_BODY + 1)
+    assert site.http.post("/next", content=too_long).status_code == 413
+    assert site.http.post("/next", content=iter([too_long])).status_code == 413, "also without Content-Length"
     assert site.events == []
+
+
+def test_a_body_is_refused_for_its_length_before_it_comes(site: Site) -> None:
+    with raw(site) as sender:
+        sender.sendall(UNFINISHED)
+        assert sender.recv(1024).startswith(b"HTTP/1.1 413 ")
 
 
 def test_slow_functions_do_not_hold_up_each_other(site: Site) -> None:
@@ -355,6 +366,9 @@ def test_answers_can_be_read_by_no_other_origin_than_those_that_were_named() -> 
 # Slow and many connections
 
 
+UNFINISHED = b"POST /next HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10000000\r\n\r\n"
+
+
 def raw(site: Site) -> socket.socket:
     host, port = site.server.url.removeprefix("http://").split(":")
     return socket.create_connection((host, int(port)), timeout=20)
@@ -404,13 +418,33 @@ def test_slow_senders_are_disconnected(site: Site, monkeypatch: pytest.MonkeyPat
             dripping.join()
 
 
-def test_many_silent_connections_do_not_block_others(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("begin", [b"", UNFINISHED, UNFINISHED.replace(b"10000000", b"100000")])
+def test_many_slow_connections_do_not_block_others(site: Site, monkeypatch: pytest.MonkeyPatch, begin: bytes) -> None:
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
-    silent = [raw(site) for _ in range(12)]
+    slow = []
     try:
+        for _ in range(12):
+            slow.append(raw(site))
+            slow[-1].sendall(begin)
         assert site.http.get("/next").status_code == 200
-        assert ends(silent[0])
+        assert ends(slow[0])
         assert len(site.server.connections) <= 8
     finally:
-        for each in silent:
+        for each in slow:
             each.close()
+
+
+def test_one_address_of_another_machine_has_a_share_of_the_connections(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "ADDRESS_CONNECTIONS", 3)
+    monkeypatch.setattr(connections, "LOOPBACK", "127.0.0.1")
+    host, port = site.server.url.removeprefix("http://").split(":")
+    own = [raw(site) for _ in range(5)]
+    others = [socket.create_connection((host, int(port)), 20, ("127.0.0.2", 0)) for _ in range(5)]
+    try:
+        assert [ends(other) for other in others[:2]] == [True] * 2
+        until(lambda: len(site.server.connections) == 5 + 3)
+    finally:
+        for connection in (*own, *others):
+            connection.close()
