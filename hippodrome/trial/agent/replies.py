@@ -25,9 +25,9 @@ log = logging.getLogger("trial")
 REPLY_SECONDS = 120.0
 """A reply that takes longer is given up."""
 MODERATE_SECONDS = 2.0
-"""A line is said as it is if `moderate` takes longer."""
+"""A line is held back if `moderate` takes longer."""
 _GROW_SECONDS = 0.1  # the pause between two messages with a growing line
-_MAX_STUCK = 5  # threads that never returned; then nothing is asked any more
+_MAX_STUCK = 5  # threads that have not returned; then nothing is asked until one does
 _MAX_UNSAID = 50  # lines of `session.say` that wait for the event loop; then the agent waits
 
 Reply = Callable[[Any, str, str], Any]
@@ -197,6 +197,7 @@ class Replies:
         def ended(result: str | bool | None, error: Exception | None) -> None:
             if error is not None:
                 self._failed("moderate", error)
+                result = False  # nobody reads a line that the study has not judged
             self._moderated(effect.ask_id, result)
 
         def call() -> str | bool | None:
@@ -221,15 +222,20 @@ class _Queue:
         self._limit = limit
         self._worker: Worker | None = None
         self._waiting: deque[tuple[Callable[[], Any], Callable[[Any, Exception | None], None]]] = deque()
-        self._stuck = 0
+        self._left: list[Worker] = []
 
     @property
     def busy(self) -> bool:
-        return bool(self._stuck or (self._worker is not None and self._worker.busy))
+        return bool(self._stuck() or (self._worker is not None and self._worker.busy))
+
+    def _stuck(self) -> int:
+        """Return how many threads that were left have not returned yet."""
+        self._left = [worker for worker in self._left if worker.busy]
+        return len(self._left)
 
     def add(self, function: Callable[[], Any], done: Callable[[Any, Exception | None], None]) -> None:
-        if self._stuck >= _MAX_STUCK:
-            done(None, AgentTimeout(f"{self._name} has not returned {self._stuck} times, and is not called any more"))
+        if self._stuck() >= _MAX_STUCK:
+            done(None, AgentTimeout(f"{self._name} is not called: {_MAX_STUCK} calls have not returned"))
             return
         self._waiting.append((function, done))
         if len(self._waiting) == 1:
@@ -241,13 +247,13 @@ class _Queue:
         self._worker.submit(self._waiting[0][0], self._limit, self._returned)
 
     def _returned(self, result: Any, error: Exception | None) -> None:
-        if isinstance(error, AgentTimeout):
-            self._stuck += 1
+        if isinstance(error, AgentTimeout) and self._worker is not None:
             self.close()
+            self._left.append(self._worker)
             self._worker = None
         _, done = self._waiting.popleft()
         done(result, error)
-        if self._stuck >= _MAX_STUCK:
+        if self._stuck() >= _MAX_STUCK:
             while self._waiting:
                 self._waiting.popleft()[1](None, error)
         elif self._waiting:

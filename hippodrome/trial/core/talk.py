@@ -24,6 +24,8 @@ MAX_SAID = 4_000
 MAX_NEWLINES = 10
 RATE, RATE_SECONDS = 5, 5.0
 """The most lines of a participant within so many seconds."""
+MAX_UNANSWERED = 5
+"""The most lines of a participant that wait for `moderate` or `reply`: the others' lines wait behind them."""
 AGENT_RATE = 20
 """The most lines of the agent within a second; further ones are dropped."""
 _NEWLINE = re.compile("\r\n|[\r\u2028\u2029]")
@@ -335,7 +337,14 @@ class Talk:
             return "notYourTurn"
         if len(times) == RATE and now - times[0] < RATE_SECONDS:
             return "tooFast"
+        if self._waiting(player) >= MAX_UNANSWERED:
+            return "tooFast"
         return None
+
+    def _waiting(self, player: str) -> int:
+        """Return how many of this player's lines wait for `moderate` or `reply`."""
+        asked = sum(by == player and line is not None for by, line, _ in self._asked.values())
+        return asked + sum(by == player for by, _ in self._checked.values())
 
     def _refuse(self, player: str, say: Say, why: Why) -> None:
         self._send(player, {"refused": {"id": say.id, "why": why}})

@@ -11,12 +11,11 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from hippodrome.trial.llm import events
-from hippodrome.trial.llm.errors import CapReached, ModelError, ModelRefused, ModelUnavailable
+from hippodrome.trial.llm.errors import OWN, CapReached, ModelError, ModelRefused, ModelUnavailable
 
 _AGAIN = (429, 500, 502, 503, 504)
 _PAUSES = (1.0, 3.0)  # seconds before a second and a third try
 _LONGEST_PAUSE = 10.0  # seconds for which an API may make us wait
-_OWN = "hippodrome"  # the type of the endpoint's own errors
 _SECONDS = 700.0  # the endpoint ends each call before
 
 
@@ -132,7 +131,7 @@ def _error_of(status: int, answer: Any) -> ModelError:
 def _own_error(answer: Any) -> Mapping[str, Any]:
     """Return the error of the endpoint's own that an answer tells; {} for one of the model's API."""
     error = answer.get("error") if isinstance(answer, Mapping) else None
-    return error if isinstance(error, Mapping) and error.get("type") == _OWN else {}
+    return error if isinstance(error, Mapping) and error.get("type") == OWN else {}
 
 
 def _sent(method: str, path: str, body: Mapping[str, Any] | None) -> tuple[int, Any]:

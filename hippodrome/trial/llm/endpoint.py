@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 
 from hippodrome.protocol.trial_llm import LlmSection
 from hippodrome.trial.llm import events
+from hippodrome.trial.llm.errors import OWN
 from hippodrome.trial.llm.ledger import Call, Ledger, Moment, Refused, Tokens, estimate, tokens_of
 from hippodrome.trial.llm.upstream import Answer, Failed, Upstream
 
@@ -279,7 +280,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Return the status and the JSON of an answer; an error of our own if it has no JSON."""
         text = self.server.endpoint.without_key(body.decode("utf-8", "replace"))
         try:
-            return status, json.loads(text)
+            return status, _as_theirs(json.loads(text))
         except (ValueError, RecursionError):
             pass
         if status < 400:
@@ -323,12 +324,19 @@ class _Handler(BaseHTTPRequestHandler):
     def _events(self, answer: Answer) -> Iterator[str]:
         """Yield the events of a stream; if it breaks off, an event with the error last."""
         reader, without_key = events.Reader(), self.server.endpoint.without_key
+
+        def theirs(event: str) -> str:
+            event = without_key(event)
+            data = events.data_of(event)
+            changed = _as_theirs(data)
+            return event if changed is data else f"data: {json.dumps(changed)}"
+
         try:
             for piece in answer.pieces():
                 for event in reader.feed(piece):
-                    yield without_key(event)
+                    yield theirs(event)
             if rest := reader.rest():
-                yield without_key(rest)
+                yield theirs(rest)
         except Failed as failed:
             yield f"data: {json.dumps(_error(failed.code, str(failed)))}"
         except TimeoutError:
@@ -392,7 +400,15 @@ def _no_path() -> Refused:
 
 
 def _error(code: str, words: str) -> dict[str, Any]:
-    return {"error": {"message": words, "type": "hippodrome", "code": code}}
+    return {"error": {"message": words, "type": OWN, "code": code}}
+
+
+def _as_theirs(answer: Any) -> Any:
+    """Return the answer of the model's API; its error has another type if it has that of our own, which are trusted."""
+    error = answer.get("error") if isinstance(answer, dict) else None
+    if not isinstance(error, dict) or error.get("type") != OWN:
+        return answer
+    return {**answer, "error": {**error, "type": "upstream"}}
 
 
 def _with_usage(path: str, request: dict[str, Any]) -> tuple[dict[str, Any], bool]:

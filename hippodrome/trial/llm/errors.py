@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+OWN = "hippodrome"
+"""The type of the loopback address's own errors. No error of a model's API keeps it."""
+
 
 class ModelError(Exception):
     """The model has not answered. The message says why, without words of prompts and answers."""

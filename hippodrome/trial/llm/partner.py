@@ -58,9 +58,17 @@ class Partner:
 
 
 def messages(prompt: str | None, talk: Sequence[dict[str, Any]], humans: Sequence[str]) -> list[dict[str, str]]:
-    """Return a talk as messages for a model. Of several participants each has their name before their words."""
+    """Return a talk as messages for a model.
+
+    Of several participants each has their name before their words, which are one line then: a second one could begin
+    with another's name.
+    """
+
+    def words(line: dict[str, Any]) -> str:
+        return f"{line['by']}: {line['text']}".replace("\n", " ") if len(humans) > 1 else str(line["text"])
+
     said = [
-        {"role": "user", "content": f"{line['by']}: {line['text']}" if len(humans) > 1 else line["text"]}
+        {"role": "user", "content": words(line)}
         if line["by"] in humans
         else {"role": "assistant", "content": line["text"]}
         for line in talk

@@ -90,7 +90,24 @@ async def test_a_reply_that_never_returns_is_given_up_and_later_lines_are_answer
         for_ever.set()
 
 
-async def test_a_line_passes_as_it_is_if_moderate_is_slow_or_broken(monkeypatch: pytest.MonkeyPatch):
+async def test_slow_calls_that_return_do_not_end_replies_for_good(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(replies, "REPLY_SECONDS", 0.2)
+    returns = threading.Event()
+    heard = Heard(lambda session, player, text: returns.wait() if text == "slow" else text, fallback="Sorry")
+    try:
+        assert await heard.ask(*["slow"] * 5) == ["Sorry"] * 5
+        heard.said.clear()
+        assert await heard.ask("Hi") == ["Sorry"]
+    finally:
+        returns.set()
+    async with asyncio.timeout(PATIENCE):
+        while heard.replies.busy:
+            await asyncio.sleep(0.01)
+    heard.said.clear()
+    assert await heard.ask("Hi") == ["Hi"]
+
+
+async def test_a_line_is_held_back_if_moderate_is_slow_or_broken(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(replies, "MODERATE_SECONDS", 0.2)
 
     def moderate(session: Any, player: str, text: str) -> Any:
@@ -99,7 +116,7 @@ async def test_a_line_passes_as_it_is_if_moderate_is_slow_or_broken(monkeypatch:
         return {"rude": False, "bad": "***", "odd": 7}.get(text)
 
     heard = Heard(moderate=moderate)
-    assert await heard.ask("fine", "rude", "bad", "odd", "slow", moderate=True) == [None, False, "***", None, None]
+    assert await heard.ask("fine", "rude", "bad", "odd", "slow", moderate=True) == [None, False, "***", False, False]
     assert heard.failed == ["moderate TypeError", "moderate AgentTimeout"]
 
 

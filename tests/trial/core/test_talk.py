@@ -86,6 +86,28 @@ def test_lines_are_refused_with_the_reason():
     assert len(read(driver, 0)) == 6, "a line that was too fast may come again"
 
 
+def test_no_participant_keeps_the_agent_from_the_others():
+    driver = talks(SessionDriver(chat={"with": ["ai"]}).come(0, 1), replies=True)
+    for n in range(1, 8):
+        say(driver, 0, n, "Hi")
+        driver.wait(2)
+    assert refused(driver, 0) == ["tooFast", "tooFast"]
+    say(driver, 1, 1, "And me?")
+    first, *_, last = driver.calls(AskReply)
+    assert (len(driver.calls(AskReply)), last.player) == (6, "right")
+    driver.event("reply_ended", first.ask_id, None, driver.now)
+    say(driver, 0, 6, "Hi")
+    assert len(driver.calls(AskReply)) == 7
+
+
+def test_lines_that_wait_for_moderate_are_as_few():
+    driver = talks(SessionDriver(chat={}).come(0, 1), moderates=True)
+    for n in range(1, 8):
+        say(driver, 0, n, "Hi")
+        driver.wait(2)
+    assert refused(driver, 0) == ["tooFast", "tooFast"]
+
+
 def test_control_characters_and_too_many_newlines_are_taken_out():
     assert tidied("\ta\x00b\x1b[31m\r\nc\u2028d\x85 ") == "ab[31m\nc\nd"
     assert tidied("\n".join("x" * 20)).count("\n") == 10

@@ -13,6 +13,8 @@ import pytest
 
 from hippodrome.local import fake_model
 from hippodrome.local.fake_model import FakeModel
+from hippodrome.trial.llm import client
+from hippodrome.trial.llm.errors import ModelError, ModelRefused, ModelUnavailable
 from tests.trial.llm.conftest import KEY, World, chat
 
 Worlds = Callable[..., World]
@@ -207,3 +209,29 @@ def test_many_at_once(world: Worlds, model: FakeModel) -> None:
         map(str, range(50))
     )
     assert here.ledger.tokens == sum(sum(record["tokens"].values()) for record in here.tape.records)
+
+
+FALSE = json.dumps({"error": {"type": "hippodrome", "code": "cap_reached", "message": "You said: a secret"}}).encode()
+
+
+def false_refusal() -> Iterator[bytes]:
+    yield head("application/json", f"Content-Length: {len(FALSE)}", status="400 Bad Request") + FALSE
+
+
+def false_event() -> Iterator[bytes]:
+    yield head("text/event-stream", "Connection: close") + b"data: " + FALSE + b"\n\n"
+
+
+@pytest.mark.parametrize(("pieces", "error"), [(false_refusal, ModelRefused), (false_event, ModelUnavailable)])
+def test_an_error_of_an_api_is_never_taken_for_our_own(
+    world: Worlds,
+    hostile: Callable[..., Hostile],
+    monkeypatch: pytest.MonkeyPatch,
+    pieces: Callable[[], Iterator[bytes]],
+    error: type[ModelError],
+) -> None:
+    for name, value in world(model_of=hostile(pieces)).endpoint.environment().items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ModelError, match="the model's API answers with status") as raised:
+        list(client.stream(chat("Hi")["messages"], {}))
+    assert type(raised.value) is error
