@@ -6,6 +6,7 @@ it, and leads to their signed link; `/lab` lists the studies. Both need a key, a
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import secrets
 import socket
@@ -19,10 +20,10 @@ import psutil
 
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control import http
-from hippodrome.control.http import Request
+from hippodrome.control.http import Refusal, Request
 from hippodrome.control.model import ids
 from hippodrome.control.model.project import Project
-from hippodrome.control.participants import frame
+from hippodrome.control.participants import forms, frame
 from hippodrome.control.participants.frame import Html
 from hippodrome.control.ports import Platform
 from hippodrome.control.storage.project_cache import ProjectCache
@@ -30,6 +31,7 @@ from hippodrome.control.storage.secret import SecretCache
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - a lab's server is there for other machines
 _NOBODY = "/join"  # no participant's id, so that a key of `/join` signs nobody's link
+RELAYS = ("/start", "/stop")  # paths whose forms may name the project
 _OURS = ("key", "projectId", "userId", "signature")
 Handler = Callable[[dict[str, Any], object], dict[str, Any]]
 
@@ -101,17 +103,18 @@ class Lab:
     def functions(self, of_study: Mapping[str, Handler]) -> dict[str, Handler]:
         """Return the functions of the web server: those of a study, and the lab's own.
 
-        `next_step` answers for the lab's studies alone, and not for others with data in the same folder.
+        They answer for the lab's studies alone, and not for others with data in the same folder.
         """
-        next_step = of_study["next_step"]
+        ours = {name: self._only_ours(function) for name, function in of_study.items()}
+        return {**ours, "join": self._join, "lab": self._show}
 
+    def _only_ours(self, function: Handler) -> Handler:
         def only_ours(event: dict[str, Any], context: object) -> dict[str, Any]:
-            query_value = Request.from_event(event).query_value("projectId")
-            if query_value is not None and query_value not in self._project_ids():
+            if not _projects_of(event) <= {*self._project_ids()}:
                 return _refused(404, "There is no such study here.")
-            return next_step(event, context)
+            return function(event, context)
 
-        return {**of_study, "next_step": only_ours, "join": self._join, "lab": self._show}
+        return only_ours
 
     def _join(self, event: dict[str, Any], _context: object) -> dict[str, Any]:
         """Answer `/join/{projectId}`: lead to the signed link of a new participant, with the link's other fields."""
@@ -148,6 +151,16 @@ class Lab:
 
     def _project(self, project_id: str) -> Project | None:
         return ProjectCache(self._platform, SecretCache(self._platform.documents)).project(project_id)
+
+
+def _projects_of(event: Mapping[str, Any]) -> set[str]:
+    """The ids of projects that a request names: in its path, its query, or the form of a start or stop request."""
+    request = Request.from_event(event)
+    named: list[object] = [(event.get("pathParameters") or {}).get("projectId"), request.query_value("projectId")]
+    if request.path in RELAYS and request.body:
+        with contextlib.suppress(Refusal):  # the function refuses it itself
+            named.append(forms.read(request).answers.get("projectId"))
+    return {str(project_id) for project_id in named if project_id is not None}
 
 
 def qr(link: str) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +38,16 @@ def publish(
 ) -> Config:
     """Check the project, copy its pages where they differ, and register it; return the project.
 
-    `subdomain` replaces the project's, and with `signed` links are signed whatever it says. `say` gets a sentence if
-    steps have changed and participants have begun. Raises `NotPublished`.
+    `subdomain` replaces the project's. With `signed`, as in a lab, links are signed whatever it says, and settings that
+    others of the network could misuse are refused. `say` gets a sentence if steps have changed and participants have
+    begun. Raises `NotPublished`.
     """
     try:
         config = read_project(folder)
     except ConfigErrors as errors:
         raise NotPublished([str(problem) for problem in errors.diagnostics]) from None
+    if signed and (refused := list(_not_in_a_lab(config))):
+        raise NotPublished(refused)
     for file in [*step_files(folder), *config.own_pages]:
         _put(documents, f"{config.project.id}/steps/{composed(file.name)}", file.read_bytes())
     # On this machine servers are processes, also if the project says that they run on AWS.
@@ -60,6 +63,20 @@ def publish(
     if changed:
         say(CHANGED.format(steps=changed))
     return config
+
+
+def _not_in_a_lab(config: Config) -> Iterator[str]:
+    """Yield a sentence for each setting that others of the network could misuse."""
+    if config.project.subdomain == "userId":
+        yield (
+            "project.subdomain is userId, which a lab's server (--host) does not allow: servers must not be "
+            "found by participants' ids; use hash"
+        )
+    if config.project.plain_clients:
+        yield (
+            "project.plainClients is true, which a lab's server (--host) does not allow: anyone in the network could "
+            "play as any participant"
+        )
 
 
 def _changed(documents: Documents, config: Config) -> str:

@@ -87,6 +87,7 @@ def test_the_list_shows_every_study_to_those_who_hold_its_key(local: Make, tmp_p
 
 def test_a_study_that_lies_in_the_data_and_is_not_served_cannot_be_opened(local: Make) -> None:
     one = local()
+    (one.folder / "steps" / "map.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'/>")
     one.run()
     assert httpx.get(f"{one.url}/next?projectId=quick&userId=ada").status_code == 200
     assert one.end() == 0
@@ -95,6 +96,14 @@ def test_a_study_that_lies_in_the_data_and_is_not_served_cannot_be_opened(local:
     one.begin("--host", HOST)
     one.url = one.wait_for_text(r"(http://[\w.]+:\d+)/join")[1]
     assert httpx.get(f"{one.url}/next?projectId=quick&userId=ada").status_code == 404
+    assert httpx.get(f"{one.url}/steps/another/map.svg").status_code == 200
+    assert httpx.get(f"{one.url}/steps/quick/map.svg").status_code == 404
+    for relay in ("start", "stop"):
+        named = {"projectId": "quick", "userId": "ada"}
+        assert "no such study here" in httpx.get(f"{one.url}/{relay}", params=named).text
+        for body in ({"data": named}, {"json": named}):
+            assert "no such study here" in httpx.post(f"{one.url}/{relay}", **body).text
+        assert httpx.post(f"{one.url}/{relay}", json={**named, "projectId": "another"}).status_code == 403
     assert one.end() == 0
 
 
@@ -251,6 +260,8 @@ def test_a_study_that_lets_clients_in_without_a_token_is_refused_in_a_lab(local:
     keys = "plainClients: true\n  frontEnd: [http://localhost:3000]\n  subdomain: userId"
     config.write_text(config.read_text().replace("live: true", f"live: true\n  {keys}"))
     one.begin("--host", HOST)
-    one.wait_for_text("project.plainClients is true, which this installation's parameter PlainClients does not allow")
+    one.wait_for_text(r"project.plainClients is true, which a lab's server \(--host\) does not allow")
+    assert "project.subdomain is userId, which a lab's server (--host) does not allow" in one.text()
+    assert "installation" not in one.text()
     assert one.process
     assert one.process.wait(30) == Exit.FAILED

@@ -123,7 +123,7 @@ class LocalPlatform:
         """
         folder = folder or self._folders[0]
         config = publish(folder, self.documents, self._subdomain, self._say, signed=self._is_lab)
-        self.tasks.add_project(config.project.id, folder)
+        self.tasks.add_project(config.project.id, folder, has_model=bool(config.models))
         return config
 
     def port_of(self, name: str) -> int | None:

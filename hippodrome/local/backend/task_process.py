@@ -10,6 +10,7 @@ Each server has a thread that follows it. If this machine refuses something, the
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import threading
 import time
@@ -55,13 +56,13 @@ class Shared:
     retry: Retry
     projects: dict[str, Path] = field(default_factory=dict)
     """The folders of projects by their ids. `project` is the folder of any other."""
+    with_model: set[str] = field(default_factory=set)  # the ids of projects whose games have a language model
     lock: threading.RLock = field(default_factory=threading.RLock)
     closed: threading.Event = field(default_factory=threading.Event)  # set when this process ends
 
     def agent_folder(self, request: TaskRequest) -> Path:
         """Return the folder of agent.py for this server."""
-        project_id = request.environment.get(environment.PROJECT_ID, "")
-        return layout.agent_folder(self.projects.get(project_id, self.project)).resolve()
+        return layout.agent_folder(self.projects.get(self._project_id(request), self.project)).resolve()
 
     def log(self, name: str) -> Path:
         """Return the log file of the server of this name."""
@@ -71,6 +72,7 @@ class Shared:
         """Return the environment variables of a server's process."""
         return {
             **inherited_environment(),
+            **self._model_key(request),
             **request.environment,
             environment.STORE: str(self.data),
             environment.SPOOL: str(self.spool),
@@ -80,6 +82,14 @@ class Shared:
             environment.AGENT_DIR: str(self.agent_folder(request)),
             "PYTHONUNBUFFERED": "1",
         }
+
+    def _model_key(self, request: TaskRequest) -> dict[str, str]:
+        """The key of the language model, for servers of a project that has one: code of other studies never sees it."""
+        key = os.environ.get(environment.LLM_KEY)
+        return {environment.LLM_KEY: key} if key and self._project_id(request) in self.with_model else {}
+
+    def _project_id(self, request: TaskRequest) -> str:
+        return request.environment.get(environment.PROJECT_ID, "")
 
 
 class TaskProcess:

@@ -151,9 +151,10 @@ class ProcessTasks:
 
     # What local mode calls beside the port
 
-    def add_project(self, project_id: str, folder: Path) -> None:
-        """Servers of this project run the code in this folder, from now on."""
+    def add_project(self, project_id: str, folder: Path, *, has_model: bool = False) -> None:
+        """Servers of this project run the code in this folder, from now on; those with a language model get its key."""
         self._shared.projects[project_id] = folder.resolve()
+        (self._shared.with_model.add if has_model else self._shared.with_model.discard)(project_id)
 
     def start(self) -> None:
         """Take over the servers of an earlier process: follow each that runs, and send the last events of the others.

@@ -150,6 +150,20 @@ def test_a_server_gets_its_environment(here: Here, monkeypatch: pytest.MonkeyPat
     assert "secret" not in (here.state / "tasks" / f"{NAME}.json").read_text()
 
 
+def test_only_servers_of_projects_with_a_language_model_get_its_key(
+    here: Here, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LLM_KEY", "sk-1")
+    tasks, names = here.tasks(), [f"s{letter * 20}-1" for letter in "abc"]
+    tasks.add_project("talks", here.project, has_model=True)
+    tasks.add_project("plays", here.project)
+    for name, project in zip(names, ("talks", "plays", "unknown"), strict=True):
+        tasks.run(request(name, PROJECT_ID=project))
+        here.wait("RUNNING", name)
+    keys = [{process.environ().get("LLM_KEY") for process in marked(here.state)[name]} for name in names]
+    assert keys == [{"sk-1"}, {None}, {None}]
+
+
 @pytest.mark.parametrize("status", [0, 3])
 def test_the_end_of_a_server_is_reported_with_its_exit_code(here: Here, status: int) -> None:
     tasks = here.tasks()
