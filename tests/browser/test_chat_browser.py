@@ -313,6 +313,50 @@ def test_after_a_reconnection_only_what_was_not_heard_is_sent_again(talking: Tal
     assert len(world.commands("say")) == 3
 
 
+def test_lines_that_a_killed_server_lost_make_room_for_others_and_own_ones_are_sent_again(
+    talking: TalkingWorld, tab: Any
+) -> None:
+    world = talking.world
+    talking.open(tab)
+    talking.say(lines=[{"n": 1, "by": "ai", "text": "Hello"}])
+    for n, text in enumerate(["stored", "lost", "lost too"], 2):
+        write(tab, text)
+        talking.echo(talking.said(n - 1)[-1], n)
+    talking.say(lines=[{"n": 5, "by": "ai", "text": "Well", "more": True}])
+    tab.wait_for_selector("text=Well")
+    stored, *lost = talking.said(3)
+    talking.history = [
+        {"n": 1, "by": "ai", "text": "Hello"},
+        {"n": 2, "by": "red", "text": "stored", "id": stored["id"]},
+        {"n": 3, "by": "blue", "text": "from Blue"},
+    ]
+    world.connections[-1].close(1011)
+    wait_for_reconnection(world, tab)
+    assert talking.said(5)[3:] == lost
+    tab.wait_for_selector(".line:not(.mine) >> text=from Blue")
+    before = [[False, "Hello"], [True, "stored"], [False, "from Blue"]]
+    assert shown(tab) == [*before, [True, "lost"], [True, "lost too"]]
+    for n, said in enumerate(lost, 4):
+        talking.echo(said, n)
+    tab.wait_for_function("() => !document.querySelector('.line.waiting')")
+    assert shown(tab) == [*before, [True, "lost"], [True, "lost too"]]
+    assert tab.locator(".line:not(.mine) >> text=from Blue").count() == 1
+    assert len(world.commands("say")) == 5
+
+
+def test_a_lost_line_is_sent_again_also_after_a_reload(talking: TalkingWorld, tab: Any) -> None:
+    talking.open(tab)
+    write(tab, "lost")
+    talking.echo(talking.said()[0], 1)
+    tab.wait_for_selector(".line:not(.waiting) >> text=lost")
+    tab.reload()
+    lost, again = talking.said(2)
+    assert again == lost
+    talking.echo(again, 1)
+    tab.wait_for_selector(".line:not(.waiting) >> text=lost")
+    assert shown(tab) == [[True, "lost"]]
+
+
 def test_two_tabs_of_a_participant_lose_and_double_no_line(talking: TalkingWorld, tab: Any, narrow: Any) -> None:
     world = talking.world
     talking.open(tab)

@@ -14,6 +14,7 @@ const BURST = 5; // lines that the server takes
 const BURST_TIME = 5_500; // in so many ms, with some to spare
 const STILL = 4_000; // ms without a key; then the participant types no longer
 const FEW_LEFT = 50; // characters
+const STORING = 10_000; // ms after its echo; then the line is stored, also if the page notices late that the server is lost
 
 const isTalk = Boolean(data.talk); // there is no game beside the panel
 const memory = `said-${data.project}-${document.body.dataset.user}-${data.step}`;
@@ -36,6 +37,7 @@ let writer; // who may write now, if one after the other writes
 let open = false; // whether the server has sent the lines so far over this connection
 let closed = false; // whether the game is over
 let unsent = []; // the participant's lines that have not come back from the server, each `{ id, text, typed, bubble }`
+let echoed = []; // the participant's lines that came back a moment ago, as in `unsent`, with the time `at`
 let newestId = 0;
 let sendings = []; // when the last lines were sent
 let typers = {}; // by name: whether they type
@@ -83,6 +85,7 @@ function showLine({ n, by, text, id, more }) {
   const sent = unsent.find((each) => by === chat.me && each.id === id);
   if (sent) {
     unsent.splice(unsent.indexOf(sent), 1);
+    echoed.push({ ...sent, at: performance.now() });
     bubble = sent.bubble;
     bubble.classList.remove("waiting");
   } else if (isNew || (!more && bubble.matches("[aria-hidden]"))) {
@@ -93,10 +96,32 @@ function showLine({ n, by, text, id, more }) {
   if (more) bubble.setAttribute("aria-hidden", "true");
   else delete typers[by];
   setText(bubble.querySelector("p"), text);
+  bubble.lineId = id;
   bubbles.set(n, bubble);
   put(bubble, n);
   if (by === chat.me && id > newestId) newestId = id;
   if (isNew && !atEnd && by !== chat.me) toNewest.hidden = false;
+}
+
+// Removes lines that the server before has lost, which gives their numbers to others: `lines` are all that there are, or
+// the last KEPT. The participant's own lost lines wait to be sent again.
+function forgetLost(lines) {
+  const oldest = lines.length < KEPT ? 0 : lines[0].n;
+  const known = new Map(lines.map((line) => [line.n, line]));
+  for (const [n, bubble] of bubbles) {
+    const line = known.get(n);
+    if (n < oldest || (line?.by === bubble.by && line.id === bubble.lineId)) continue;
+    bubbles.delete(n);
+    bubble.remove();
+  }
+  const lost = echoed.filter(({ id }) => !lines.some((line) => line.by === chat.me && line.id === id));
+  echoed = echoed.filter((each) => !lost.includes(each));
+  for (const { bubble } of lost) {
+    delete bubble.n;
+    bubble.classList.add("waiting");
+    stack.insertBefore(bubble, unsent[0]?.bubble ?? null);
+  }
+  unsent.unshift(...lost);
 }
 
 function hearLines(message) {
@@ -105,6 +130,7 @@ function hearLines(message) {
     log.setAttribute("aria-live", "off"); // after a reload, nobody wants to hear all of it again
     setTimeout(() => log.setAttribute("aria-live", "polite"), 1_000);
   }
+  if (isHistory) forgetLost(message.lines);
   for (const line of message.lines) showLine(line);
   while (stack.childElementCount > KEPT) {
     bubbles.delete(stack.firstElementChild.n);
@@ -131,7 +157,8 @@ function follow() {
 const nextId = () => (newestId = Math.max(newestId + 1, Date.now()));
 
 function keep() {
-  remember(memory, { lines: unsent.map(({ id, text, typed }) => ({ id, text, typed })), draft: field.value });
+  if (open) echoed = echoed.filter(({ at }) => performance.now() - at < STORING);
+  remember(memory, { lines: [...echoed, ...unsent].map(({ id, text, typed }) => ({ id, text, typed })), draft: field.value });
 }
 
 function addWaiting(line) {
@@ -250,6 +277,7 @@ hooks.message.push((message) => {
 
 hooks.overlay.push((name) => {
   if (["loading", "lost", "elsewhere"].includes(name)) {
+    if (open) keep();
     open = toldTyping = false;
     typers = {};
     showWhoWrites();
