@@ -89,6 +89,19 @@ async def test_a_game_of_words_alone_needs_no_environment_and_no_picture(launch,
     assert 2 <= answers["frames"] <= 4
 
 
+async def test_the_second_round_of_two_begins_with_all_its_time(launch):
+    players = {"buyer": "human", "seller": "human"}
+    trial = {"game": "talk", "episodeSeconds": 2, "maxEpisodes": 2, "betweenEpisodes": 0.5, "players": players}
+    server = launch_formed(
+        launch, agent="class Agent:\n    def on_episode_end(self, session):\n        pass\n", trial=trial
+    )
+    async with member(server, "anna") as anna, member(server, "bert"):
+        await anna.until(lambda: anna.state.get("episode") == 2 and anna.state["state"] == "playing")
+        assert anna.state["timeLeft"] > 1, anna.state
+        await anna.say(command="stop")
+        await anna.closed()
+
+
 DEALS = """
 class Agent:
     def moderate(self, session, player, text):

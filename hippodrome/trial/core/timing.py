@@ -70,6 +70,7 @@ class Timing:
         self._between = config.between_seconds
         self._max_steps = config.max_steps
         self._episode = EpisodeTime(config.reset_freeze, config.episode_seconds)
+        self._limit = config.episode_seconds or None
         self._pacer = Pacer()
         self._due: float | None = None
         self._last_step: float | None = None
@@ -201,6 +202,10 @@ class Timing:
         half_frame = 0.5 / progress.frame_rate  # the step less than half a frame before the limit is the nearest to it
         return "episodeSeconds" if left is not None and left <= half_frame else None
 
+    def _time_left(self, progress: TrialProgress, now: float) -> float | None:
+        """Return the seconds of play that are left; all of them if the episode before is still being recorded."""
+        return self._limit if progress.needs_reset and progress.ended else self._episode.left(now)
+
     # ---- what clients are told
 
     def state_times(self, progress: TrialProgress, now: float, session: Mapping[str, Any] | None) -> StateTimes:
@@ -209,6 +214,6 @@ class Timing:
             next_in=self._break_left(progress, now),
             turn_ends_in=None if progress.turns is None else progress.turns.ends_in(now),
             starts_in=self._episode.starts_in(now) if progress.shows_first_picture else None,
-            time_left=None if progress.over or progress.on_break else self._episode.left(now),
+            time_left=None if progress.over or progress.on_break else self._time_left(progress, now),
             session=session,
         )
