@@ -120,8 +120,9 @@ def _games(folder: Path, config: Config, group: int | None) -> list[dict[str, An
     """The `options` and `answers` that `reset` gets in the games of the study and at all levels, each once.
 
     The first has the options of `trial`, with which the agent plays. The answers are made up, and None if a game's
-    agent reads none.
+    agent reads none. `condition` and `run` are those of `Session`, with the first level where the options are the same.
     """
+    first = {factor.name: next(iter(factor.levels)) for factor in config.design.conditions}
     base = config.registration()["trial"]
     path = own_steps(config.design.steps, config.design.blocks, None)
     given = _made_up(folder, config, group)
@@ -135,9 +136,11 @@ def _games(folder: Path, config: Config, group: int | None) -> list[dict[str, An
                 {
                     "options": trial.get("options") or {},
                     "answers": _answers(path[:at], step, trial["answers"], given) if trial.get("answers") else None,
+                    "condition": {name: section.levels.get(name, level) for name, level in first.items()},
+                    "run": {**step.levels, "position": 1} if step.levels else {},
                 }
             )
-    played = {"options": base.get("options") or {}, "answers": games[0]["answers"]}
+    played = {**games[0], "options": base.get("options") or {}}
     return [played, *(game for at, game in enumerate(games) if game not in (played, *games[:at]))]
 
 

@@ -96,7 +96,7 @@ def _try(report: Path, deadline: Deadline) -> None:
 
     def begin_session(game: Mapping[str, Any]) -> None:
         now = replace(config, options=game["options"])
-        _begin_session(player, players, progress, now, folder=folder, answers=game["answers"])
+        _begin_session(player, players, progress, now, folder=folder, game=game)
 
     def reset() -> Any:
         os.environ.__class__ = usual_class
@@ -237,19 +237,20 @@ def _begin_session(
     config: TrialSection,
     *,
     folder: Path,
-    answers: Mapping[str, Any] | None,
+    game: Mapping[str, Any],
 ) -> None:
-    """Give the agent the options of `config` and answers, and call its callbacks as on a server.
+    """Give the agent the options of `config` and the game's answers, and call its callbacks as on a server.
 
     What they say, nobody hears.
     """
     humans = tuple(player.name for player in players if player.human)
+    answers, names = game["answers"], tuple(player.name for player in players)
     given = answers if answers is None or len(humans) == 1 else dict.fromkeys(humans, answers)
     player.set_game(config.options, given)
     before = progress.callbacks
     progress.callbacks = callbacks = Callbacks(
         player.callbacks,
-        TrialFacts("check", "check", None, tuple(player.name for player in players), humans, answers=given or {}),
+        TrialFacts("check", "check", None, names, humans, game["condition"], game["run"], given or {}),
         lambda: player.env,
         seconds=config.callback_seconds,
         stamp=dict,

@@ -36,8 +36,10 @@ class TalkGame:
         """Let a second pass."""
         reward, success = self._end or (0.0, False)
         over = self._end is not None
-        if isinstance(reward, Mapping):
+        if isinstance(reward, Mapping) and self.possible_agents:
             rewards: Any = {player: float(reward.get(player, 0.0)) for player in self.possible_agents}
+        elif isinstance(reward, Mapping):
+            rewards = float(sum(reward.values()))
         else:
             rewards = self._for_each(float(reward))
         info = {"success": True} if success else {}

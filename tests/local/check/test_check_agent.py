@@ -148,7 +148,7 @@ def test_an_agent_that_fails_with_the_options_of_one_level_only_is_reported(fold
         "        return self.env",
     )
     (problem,) = tried(folder)
-    assert 'reset(), with the options {"advice": "hidden"}, fails' in problem
+    assert 'reset(), with the options {"advice": "hidden"} and the condition {"advice": "hidden"}, fails' in problem
     assert "AssertionError" in problem
 
 
@@ -167,6 +167,19 @@ def test_an_agent_gets_made_up_answers_to_the_steps_that_a_game_names(folder: Pa
     problems = tried(folder)
     assert (problems == []) == is_well, problems
     assert is_well or f"reset() fails: KeyError: '{field}'" in str(problems)
+
+
+@pytest.mark.parametrize(("level", "is_well"), [("shown", True), ("seen", False)])
+def test_callbacks_find_their_participants_condition(folder: Path, level: str, is_well: bool) -> None:
+    config(folder, "project:\n", "project:\n  conditions: {advice: [shown, hidden]}\n")
+    agent(
+        folder,
+        "    def reset(self, seed=None):\n        return self.env",
+        "    def on_session_start(self, session):\n"
+        f"        assert session.condition['advice'] == '{level}'\n"
+        "    def reset(self, seed=None):\n        return self.env",
+    )
+    assert (tried(folder) == []) == is_well
 
 
 def test_an_agent_that_fails_in_one_group_only_is_reported(folder: Path) -> None:
