@@ -19,7 +19,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from hippodrome.local.backend import authority
 from hippodrome.local.backend.authority import Authority
-from hippodrome.local.web import connections
+from hippodrome.local.web import app as web_app
+from hippodrome.local.web import connections, server
 from hippodrome.local.web.names import Names
 from testing.waiting import until
 from tests.local.conftest import Local
@@ -330,6 +331,45 @@ def test_silent_connections_do_not_block_the_port_of_names(
     finally:
         for each in silent:
             each.close()
+
+
+@pytest.fixture
+def site(made: Authority) -> Iterator[tuple[int, httpx.Client]]:
+    """A web server with TLS: its port, and a client."""
+    app = web_app.App({}, lambda _: None)
+    web = server.WebServer(app, server.listen(0), tls=made.context("localhost"))
+    web.start()
+    trusted = ssl.create_default_context(cafile=made.certificate)
+    with httpx.Client(base_url=web.url, verify=trusted, timeout=20) as client:
+        yield int(web.url.rpartition(":")[2]), client
+    web.close()
+
+
+def test_silent_connections_do_not_block_pages_with_tls(
+    site: tuple[int, httpx.Client], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port, client = site
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
+    silent = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(12)]
+    try:
+        assert client.get("/healthz").status_code == 200
+        assert [each.recv(1) for each in silent[:5]] == [b""] * 5
+        silent[-1].setblocking(False)
+        with pytest.raises(BlockingIOError):
+            silent[-1].recv(1)
+    finally:
+        for each in silent:
+            each.close()
+
+
+def test_a_silent_connection_is_closed_before_its_handshake(
+    site: tuple[int, httpx.Client], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port, client = site
+    monkeypatch.setattr(connections, "HANDSHAKE_SECONDS", 0.3)
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as silent:
+        assert silent.recv(1) == b""
+    assert client.get("/healthz").status_code == 200
 
 
 def test_the_authority_is_trusted_only_for_server_certificates(made: Authority) -> None:

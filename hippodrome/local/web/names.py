@@ -19,7 +19,6 @@ from hippodrome.local.web import connections
 PORT = 5000
 """The port of HIPPO's servers, to which its front end connects."""
 _PIECE = 16_384  # bytes that may wait here; so a trial server notices when its client is slow
-_HANDSHAKE_SECONDS = 10.0
 _BACKLOG = 100
 _PAUSE = 0.5  # seconds until the next try, after a connection could not be accepted
 
@@ -106,7 +105,7 @@ class Names:
         protocol = asyncio.StreamReaderProtocol(reader)
         try:
             transport, _ = await self._loop.connect_accepted_socket(
-                lambda: protocol, accepted, ssl=self._context, ssl_handshake_timeout=_HANDSHAKE_SECONDS
+                lambda: protocol, accepted, ssl=self._context, ssl_handshake_timeout=connections.HANDSHAKE_SECONDS
             )
         except OSError:  # no TLS, a name without a server, or a handshake that took too long
             return

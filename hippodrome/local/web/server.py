@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import socket
 import ssl
@@ -14,6 +15,7 @@ from typing import Any
 
 import uvicorn
 
+from hippodrome.local.web import connections
 from hippodrome.local.web.app import App
 from hippodrome.local.web.connections import HttpConnection
 from hippodrome.local.web.relay import Find, Relay
@@ -24,6 +26,7 @@ _NO_ROOM = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)  # errors o
 
 Report = Callable[[BaseException], None]
 HIGHEST_PORT = 65535
+_PAUSE = 0.5  # seconds until the next try, after a connection could not be accepted
 
 
 class NoPort(Exception):
@@ -68,15 +71,66 @@ def _answers(port: int, host: str) -> bool:
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's server. `report` gets the error if this machine refuses a connection; asyncio accepts it later."""
+    """uvicorn's server. `report` gets the error if this machine refuses a connection; it is accepted later.
 
-    def __init__(self, config: uvicorn.Config, report: Report | None) -> None:
+    With `tls` it accepts connections itself, since uvicorn limits neither the time nor the number of TLS handshakes.
+    """
+
+    def __init__(self, config: uvicorn.Config, report: Report | None, tls: ssl.SSLContext | None) -> None:
         super().__init__(config)
         self._report = report
+        self._tls = tls
+        self._accepting: asyncio.Task[None] | None = None
+        self._handshakes: dict[asyncio.Task[None], None] = {}  # the oldest first
 
     async def serve(self, sockets: list[socket.socket] | None = None) -> None:
         asyncio.get_running_loop().set_exception_handler(self._tell)
         await super().serve(sockets)
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        if self._tls is None or sockets is None:
+            await super().startup(sockets)
+            return
+        await super().startup([])
+        (listener,) = sockets
+        self._accepting = asyncio.get_running_loop().create_task(self._accept(listener, self._tls))
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        tasks = [*([self._accepting] if self._accepting else []), *self._handshakes]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await super().shutdown(sockets)
+
+    async def _accept(self, listener: socket.socket, tls: ssl.SSLContext) -> None:
+        """Accept connections. If as many as `connections.most` are in their handshake, close the oldest of them."""
+        loop = asyncio.get_running_loop()
+        listener.setblocking(False)
+        while True:
+            try:
+                accepted, _ = await loop.sock_accept(listener)
+            except OSError as error:  # such as no more open files
+                if self._report is not None and error.errno in _NO_ROOM:
+                    self._report(error)
+                await asyncio.sleep(_PAUSE)
+                continue
+            if len(self._handshakes) >= connections.most():
+                oldest = next(iter(self._handshakes))
+                self._handshakes.pop(oldest)
+                oldest.cancel()
+            task = loop.create_task(self._shake_hands(accepted, tls))
+            self._handshakes[task] = None
+            task.add_done_callback(lambda done: self._handshakes.pop(done, None))
+            await asyncio.sleep(0)  # so the task begins, and owns the socket
+
+    async def _shake_hands(self, accepted: socket.socket, tls: ssl.SSLContext) -> None:
+        with contextlib.suppress(OSError):  # no TLS, or a handshake that took too long
+            await asyncio.get_running_loop().connect_accepted_socket(
+                self._protocol, accepted, ssl=tls, ssl_handshake_timeout=connections.HANDSHAKE_SECONDS
+            )
+
+    def _protocol(self) -> HttpConnection:
+        return HttpConnection(self.config, self.server_state, self.lifespan.state)
 
     def _tell(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
@@ -117,9 +171,8 @@ class WebServer:
             ws=relay,
             timeout_graceful_shutdown=2,
             timeout_keep_alive=5,
-            ssl_context_factory=(lambda *_: tls) if tls else None,
         )
-        self._server = _Server(config, report)
+        self._server = _Server(config, report, tls)
         self._thread = threading.Thread(target=self._server.run, args=[[listener]], name="web", daemon=True)
 
     @property
