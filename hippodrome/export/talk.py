@@ -74,7 +74,7 @@ def columns(in_sessions: bool) -> list[Column]:
 def messages(state: ExportState, in_sessions: bool) -> Iterator[list[Any]]:
     """Yield a row for each line that was said, or that the agent's `moderate` has held back.
 
-    `participant` is who has said it; in a game of one participant, the participant of the game. `replySeconds` is the
+    `participant` is who has said it, None if it was the agent. `replySeconds` is the
     time since the line that it answers: for a line of the agent's `reply`, the line that it was asked; else the last
     line of somebody else that its speaker has read, if that is newer than their own last line.
     """
@@ -90,7 +90,7 @@ def messages(state: ExportState, in_sessions: bool) -> Iterator[list[Any]]:
         by, time, typed = str(line.get("by", "")), when(line.get("time")), as_whole(line.get("typed"))
         to = line.get("to")
         held = line.get("held") is True
-        number = found.participant.number if found.participant else found.people.get(by)
+        number = found.participant.number if found.participant and "id" in line else found.people.get(by)
         answered = None if held or time is None else _answered(line, by, before)
         yield [
             number,
