@@ -1,4 +1,4 @@
-"""Links for trying the cells of `conditions`: `&cell=helpful,on` gives a new participant this cell.
+"""Links for trying the cells of `conditions`: `&cell=helpful,on` gives a new participant, or a new session, this cell.
 
 Only the web server of one machine knows `cell`: it assigns the participant before `next_step` is called, which knows
 nothing of it. On AWS the cell of a participant is always drawn.
@@ -48,7 +48,7 @@ class OwnCells:
         project_id, user_id, cell = query.get("projectId"), query.get("userId"), query[FIELD]
         project = self._project(project_id) if ids.is_project_id(project_id) else None
         names = cell_names(project) if project is not None else []
-        if project is None or not names or project.has_sessions:
+        if project is None or not names:
             return None
         if cell not in names:
             text = f"cell is one of {'; '.join(names)}."

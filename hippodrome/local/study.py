@@ -236,17 +236,6 @@ class Study:
         project, link = config.project, self._link(config)
         if not project.has_sessions:
             return []
-        run = secrets.token_hex(2)
-        user_ids = own_places.user_ids(
-            project.id,
-            project.players,
-            project.matching,
-            config.groups,
-            lambda number: _new_id() if project.signed_links else f"try-{run}-{number}",
-        )
-        queries = [
-            self._signed(config, user_id) if project.signed_links else f"&userId={user_id}" for user_id in user_ids
-        ]
         text = _TOGETHER.format(
             places="both" if project.players == 2 else f"all {project.players}", patience=f"{project.patience:g}"
         )
@@ -255,29 +244,46 @@ class Study:
             Text(""),
             *(Text(line) for line in text.splitlines()),
             *([Text(f"  {advice}")] if advice else []),
-            *(Text(f"    {link}{each}", "green") for each in queries),
+            *(Text(f"    {link}{each}", "green") for each in self._place_queries(config)),
         ]
 
+    def _place_queries(self, config: Config) -> list[str]:
+        """What is appended to the study's link for each place of a new session."""
+        project, run = config.project, secrets.token_hex(2)
+        user_ids = own_places.user_ids(
+            project.id,
+            project.players,
+            project.matching,
+            config.groups,
+            lambda number: _new_id() if project.signed_links else f"try-{run}-{number}",
+        )
+        return [self._signed(config, user_id) if project.signed_links else f"&userId={user_id}" for user_id in user_ids]
+
     def _how_to_try_cells(self, config: Config) -> list[Text]:
-        """With `conditions`: a link for each of the first cells."""
+        """With `conditions`: a link for each of the first cells; with `players` one for each place."""
         project, link = self._published_project(config), self._link(config)
-        names = own_cells.cell_names(project) if project and not project.has_sessions else []
+        names = own_cells.cell_names(project) if project else []
         if not names or project is None:
             return []
         first, more = names[: own_cells.SHOWN], len(names) - own_cells.SHOWN
         width = max(map(len, first))
+        text = _CELLS_TOGETHER if project.has_sessions else _CELLS
         return [
             Text(""),
-            Text(f"  {_CELLS.format(factors=', '.join(factor.name for factor in project.conditions))}"),
+            Text(f"  {text.format(factors=', '.join(factor.name for factor in project.conditions))}"),
             *(
-                Text.assemble(
-                    f"    {name:{width}}  ",
-                    (f"{link}{self._signed(config, _new_id()) if project.signed_links else ''}&cell={name}", "green"),
-                )
+                Text.assemble(f"    {name:{width}}  ", (f"{link}{query}&cell={name}", "green"))
                 for name in first
+                for query in self._cell_queries(config)
             ),
             *([Text(f"    … and {more} more, such as &cell={names[-1]}")] if more > 0 else []),
         ]
+
+    def _cell_queries(self, config: Config) -> list[str]:
+        """What is appended to the study's link for each new participant who tries a cell."""
+        if config.project.has_sessions:
+            return self._place_queries(config)
+        return [self._signed(config, _new_id()) if config.project.signed_links else ""]
 
     def _published_project(self, config: Config) -> Project | None:
         cache = ProjectCache(self._platform, SecretCache(self._platform.documents))
@@ -314,6 +320,10 @@ _TOGETHER = """\
   To play in {places} places yourself, open these links in windows side by side: a page that is hidden counts as away.
   Come to the game in each within {patience} seconds of the others (`patience`):"""
 _CELLS = "To try a cell yourself ({factors}), open its link; it counts on this machine only, and AWS draws the cells:"
+_CELLS_TOGETHER = (
+    "To try a cell yourself ({factors}), open its links side by side; it counts on this machine only, and AWS draws "
+    "the cells:"
+)
 _FOR_ALL = "Whoever opens the link gets an id of their own; add &userId=… to choose it."
 _FOR_ONE = "signedLinks is true: this link is for one participant; each start prints another."
 _OPEN = "Other users of this machine can read the folder {data}. To change that: chmod -R go-rwx {data}"

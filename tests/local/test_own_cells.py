@@ -12,9 +12,10 @@ import pytest
 
 from hippodrome.functions import installed, next_step
 from hippodrome.local.own_cells import OwnCells
+from hippodrome.protocol.keys import membership_key
 from testing.designed import DesignedStudy, write
 from testing.fake_platform import FakePlatform
-from tests.control.test_designs import PAGES, SOUP
+from tests.control.test_designs import ABOUT, PAGES, PAIRS, SOUP
 from tests.local.conftest import Local
 
 
@@ -43,8 +44,8 @@ def platform(tmp_path: Path) -> FakePlatform:
     return platform
 
 
-def condition(platform: FakePlatform, user: str) -> dict[str, str] | None:
-    found = platform.documents.get(f"soup/users/{user}/assignment.json")
+def condition(platform: FakePlatform, user: str, project: str = "soup") -> dict[str, str] | None:
+    found = platform.documents.get(f"{project}/users/{user}/assignment.json")
     return json.loads(found.body)["condition"] if found else None
 
 
@@ -54,6 +55,20 @@ def test_a_link_with_a_cell_gives_this_cell_to_a_new_participant(platform: FakeP
     assert condition(platform, "ada") == {"partner": "lazy", "advice": "on"}
     here(asked(projectId="soup", userId="ada", cell="helpful,on"), None)
     assert condition(platform, "ada") == {"partner": "lazy", "advice": "on"}
+
+
+def test_the_links_of_two_who_play_together_give_the_cell_to_their_session(tmp_path: Path) -> None:
+    platform = FakePlatform()
+    installed.use(platform)
+    DesignedStudy(write(tmp_path / "pairs", PAIRS, {**PAGES, **ABOUT}), platform)
+    here = OwnCells(platform, next_step.handler).handler
+    here(asked(projectId="pairs", userId="ann", cell="best"), None)
+    assert platform.documents.get("pairs/users/ann/assignment.json") is None, "nobody knows with whom ann plays"
+    membership = json.dumps({"session": "s." + 24 * "a", "members": 2, "players": 2}).encode()
+    for user in ("ann", "ben"):
+        platform.documents.put(membership_key("pairs", user), membership)
+        here(asked(projectId="pairs", userId=user, cell="best"), None)
+        assert condition(platform, user, "pairs") == {"pay": "best"}
 
 
 def test_on_aws_nobody_can_choose_their_cell(platform: FakePlatform) -> None:

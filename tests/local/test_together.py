@@ -30,6 +30,21 @@ def test_make_run_prints_a_link_for_all_and_one_for_each_place(local: Callable[.
 
 
 @pytest.mark.parametrize("signed", [False, True])
+def test_each_cell_has_a_link_for_each_place(local: Callable[..., Local], signed: bool) -> None:
+    held = local(start=2)
+    (held.folder / "agent.py").write_text(AGENT)
+    configured(held.folder, f"  conditions: {{tone: [warm, cold]}}\n  signedLinks: {str(signed).lower()}\n")
+    held.run()
+    said = held.wait_for_text(r"To try a cell yourself \(tone\)(.|\n)*Ctrl-C")[0]
+    links = re.findall(r"http://\S+", said)
+    assert [link.partition("&cell=")[2] for link in links] == ["warm", "warm", "cold", "cold"]
+    assert len(set(links)) == 4
+    for link in links:
+        with urlopen(link) as answer:
+            assert "<h1>hello</h1>" in answer.read().decode()
+
+
+@pytest.mark.parametrize("signed", [False, True])
 def test_the_links_are_of_participants_who_may_play_together(local: Callable[..., Local], signed: bool) -> None:
     held = local(start=2)
     (held.folder / "agent.py").write_text(AGENT)

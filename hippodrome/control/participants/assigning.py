@@ -53,9 +53,9 @@ class Assigning:
         """Draw the participant's levels and orders, and write their assignment. A second time it is the same.
 
         The result is None as long as it is not known with whom the participant plays. Who plays with nobody gets no
-        levels and no runs. `project` is the study, not a path. With the name of a `cell` a participant who plays alone
-        gets this one: only a study on one machine gives it (`local/own_cells.py`). Raises `RetryLater` if too many are
-        assigned at this moment.
+        levels and no runs. `project` is the study, not a path. With the name of a `cell` the participant, or their
+        session, gets this one: only a study on one machine gives it (`local/own_cells.py`). Raises `RetryLater` if too
+        many are assigned at this moment.
         """
         if not project.has_sessions:
             return self._assignment(project, user_id, cell)
@@ -65,7 +65,7 @@ class Assigning:
         if membership.session is None:
             alone = Assignment(project.version, orders={block.name: () for block in project.blocks})
             return self._created(project, user_id, alone)
-        return self._created(project, user_id, self._assignment(project, membership.session))
+        return self._created(project, user_id, self._assignment(project, membership.session, cell))
 
     def _assignment(self, project: Project, owner: str, cell: str | None = None) -> Assignment:
         """The assignment of a participant, or of a session, drawn now or before."""
