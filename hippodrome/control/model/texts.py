@@ -393,6 +393,61 @@ _TALK = {
         "Your conversation is saved. No connection. Trying again… Please stay on this page; it will continue "
         "automatically. If this lasts more than a few minutes, try another network."
     ),
+    "talkStageStarting": "Starting your server",
+    "talkStageReady": "Ready",
+    "talkMovedTitle": "Your conversation is moving to another server",
+    "talkMoved": (
+        "The previous server stopped working. This is not your fault. Please wait: the conversation will appear "
+        "on this page automatically. Your earlier answers are saved."
+    ),
+    "talkNeedsScript": (
+        "The conversation needs JavaScript, which is turned off in this browser. Please turn it on, or open your "
+        "study link in another browser."
+    ),
+    "talkFailed": "The conversation could not start",
+    "talkNotHeld": "The conversation could not take place",
+    "talkStopped": "The researchers stopped the server for your conversation.",
+    "talkIdle": "The conversation was inactive for too long, or its time limit was reached, so it was closed.",
+    "talkNoServer": "The conversation did not work on any of the servers we tried. This is not your fault.",
+    "talkNotSetUp": (
+        "A problem with the study’s setup prevents your conversation from starting. This is not your fault."
+    ),
+    "talkNoCapacity": "No server is available for your conversation right now. This is not your fault.",
+    "talkFull": "All places in this conversation are taken right now. This is not your fault.",
+    "talkServerGone": "The server has stopped.",
+    "talkKept": "Your earlier answers are saved.",
+    "talkWithout": "You can continue the study without this conversation.",
+    "talkWithoutOrAgain": "You can continue the study without this conversation, or try it again.",
+    "talkSkip": "Continue without the conversation",
+    "talkHere": "Continue here instead",
+    "talkGetReadyIn": "Get ready. The conversation starts in {time}.",
+    "talkGoWithout": "you will continue without this conversation",
+    "talkTooSlow": "Your connection is too slow to take part. This is not your fault. Please continue with the study.",
+    "talkRoundFailed": "Something went wrong, so this round has ended. You will continue with the next round.",
+    "talkRoundAgain": (
+        "This round could not be resumed, so it starts again from the beginning. Your earlier rounds are saved."
+    ),
+    "talkBroken": "Something went wrong, so the conversation ends here. What you have said so far is saved.",
+    "talkPartnerLeft": (
+        "Another participant left, so the conversation has ended for everyone. This is not your fault. What you "
+        "have said so far is saved. Please continue with the study."
+    ),
+    "talkPartnerStopped": (
+        "Another participant ended the conversation, so it is over for everyone. This is not your fault. What "
+        "you have said so far is saved. Please continue with the study."
+    ),
+    "talkPartnerMissing": (
+        "Another participant did not join, so the conversation cannot take place. This is not your fault. Please "
+        "continue with the study."
+    ),
+    "talkLeft": (
+        "You were away for longer than the others could wait, so the conversation has ended for everyone. What "
+        "you have said so far is saved. Please continue with the study."
+    ),
+    "talkPing": (
+        "Your connection is too slow to take part. This is not your fault: the server may be far away, or others "
+        "may be using your network. Please continue with the study."
+    ),
 }
 IN_TALK = {
     "game": "talkTitle",
@@ -436,6 +491,38 @@ IN_TALK = {
     "otherLeft": "talkOtherLeft",
     "someLeft": "talkSomeLeft",
     "savedOffline": "talkSavedOffline",
+    "stageStarting": "talkStageStarting",
+    "stageReady": "talkStageReady",
+    "movedTitle": "talkMovedTitle",
+    "moved": "talkMoved",
+    "needsScript": "talkNeedsScript",
+    "failedTitle": "talkFailed",
+    "lostTitle": "talkNotHeld",
+    "stopped": "talkStopped",
+    "idle": "talkIdle",
+    "failed": "talkNoServer",
+    "refused": "talkNotSetUp",
+    "noCapacity": "talkNoCapacity",
+    "full": "talkFull",
+    "computerGone": "talkServerGone",
+    "kept": "talkKept",
+    "without": "talkWithout",
+    "withoutOrAgain": "talkWithoutOrAgain",
+    "goWithoutGame": "talkSkip",
+    "playHere": "talkHere",
+    "getReadyIn": "talkGetReadyIn",
+    "goWithout": "talkGoWithout",
+    "tooSlow": "talkTooSlow",
+    "saidRoundFailed": "talkRoundFailed",
+    "saidRoundAgain": "talkRoundAgain",
+    "saidGameFailed": "talkBroken",
+    "saidPartnerLeft": "talkPartnerLeft",
+    "saidPartnerStopped": "talkPartnerStopped",
+    "saidPartnerMissing": "talkPartnerMissing",
+    "saidLeft": "talkLeft",
+    "saidPing": "talkPing",
+    "endedTitle": "talkEnded",
+    "playing": "talkTitle",
 }
 """By the name of a text on the page of a game: that of the text that stands there if the game is `talk`."""
 NOT_IN_TALK = ("yourScore", "totalScore", "orArrow")

@@ -55,8 +55,14 @@ TOGETHER = ("people.js", "lobby.js")
 """The modules of a game for several participants. `lobby.js` is last: the code after it waits for the match."""
 
 
+def texts_of(project: Project) -> Texts:
+    """Return the texts of the game page: those of a conversation if the game is `talk`."""
+    texts = Texts(project.texts)
+    return texts.in_talk() if is_talk(project.trial) else texts
+
+
 def modules_of(project: Project) -> tuple[str, ...]:
     """Return the names of the modules that a project needs besides `main.js` and its imports."""
     own = tuple(name for name, needed in MODULES.items() if needed(project.trial))
-    own += OWN_WORDS if Texts(project.texts).of_server() else ()
+    own += OWN_WORDS if texts_of(project).of_server() else ()
     return own + TOGETHER if project.has_sessions else own

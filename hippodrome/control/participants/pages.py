@@ -140,7 +140,7 @@ def game_page(view: GameView) -> Page:
     nonce = secrets.token_urlsafe(16)
     modules = game_modules.modules_of(view.project)
     is_talk = game_modules.is_talk(view.project.trial)
-    texts = Texts(view.project.texts).in_talk() if is_talk else Texts(view.project.texts)
+    texts = game_modules.texts_of(view.project)
     state = str(view.state["state"])
     over = is_over(view.state)
     data: dict[str, Any] = {

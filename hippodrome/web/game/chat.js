@@ -282,6 +282,7 @@ hooks.overlay.push((name) => {
     typers = {};
     showWhoWrites();
   }
+  if (isTalk && name === "break") setText(find("announce"), find("overlay-title").textContent); // there is no score
   if (isTalk && name === "playing" && hasMouse.matches) field.focus({ preventScroll: true });
 });
 

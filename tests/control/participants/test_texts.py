@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from hippodrome.control.config.__main__ import main as command
-from hippodrome.control.model.texts import ENGLISH, GROUPS, IN_ENGLISH, IN_TALK, SAID, Texts, places
+from hippodrome.control.model.texts import ENGLISH, GROUPS, IN_ENGLISH, IN_TALK, PLACE, SAID, Texts, places, texts_of
 from hippodrome.control.participants import frame, game_modules, scripts
 from hippodrome.control.participants.texts import NAMED, in_script, in_template
 from hippodrome.trial.core import session, trial
@@ -40,6 +40,12 @@ NO_WORDS = {
     "Accept",
 }
 """Names of keys, as browsers call them, of a font and of a header."""
+
+OF_GAMES = {
+    *("movedProgramTitle", "movedProgram", "picture", "pictures", "timeUpEnds"),
+    *("playComputer", "beginWithFew", "aloneWithOne", "aloneWithSome", "playWithBoth"),
+}
+"""Texts that do not stand on a page of talk: on pictures, turns, computer players, and other front ends."""
 
 
 @pytest.mark.parametrize("file", SOURCES, ids=lambda path: path.name)
@@ -134,6 +140,15 @@ def test_a_page_of_talk_speaks_of_rounds_and_a_conversation_and_not_of_a_score()
     assert Texts({})["gameOver"] == ENGLISH["gameOver"]
     for name, own in IN_TALK.items():
         assert set(places(ENGLISH[own])) == set(places(ENGLISH[name])), name
+
+
+def test_a_page_of_talk_has_no_word_of_a_game() -> None:
+    texts = Texts({}).in_talk()
+    of_games = re.compile(r"\b(games?|play(ed|ing)?)\b", re.IGNORECASE)
+    said = {name: PLACE.sub("", texts[name]) for name in texts_of(has_game=True, has_sessions=True) if name not in SAID}
+    assert {name for name, text in said.items() if of_games.search(text)} == OF_GAMES
+    assert not any(of_games.search(text) for text in texts.of_server().values())
+    assert texts.of_server().keys() == set(SAID.values())
 
 
 def test_the_page_gets_texts_for_messages_of_servers_only_if_the_study_has_its_own() -> None:
