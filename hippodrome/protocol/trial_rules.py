@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from hippodrome.protocol import values
 from hippodrome.protocol.players import GYM_PLAYER
 from hippodrome.protocol.similar import did_you_mean
-from hippodrome.protocol.trial import TrialSection
+from hippodrome.protocol.trial import TALK, TrialSection
 from hippodrome.protocol.trial_sections import AI
 from hippodrome.protocol.values import SectionProblem
 
@@ -125,7 +125,7 @@ def _chat(trial: TrialSection) -> Iterator[SectionProblem]:
         if len(phrase) > chat.max_length:
             sentence = f"has {len(phrase)} characters, and maxLength is {chat.max_length}"
             yield SectionProblem(("chat", "phrases", index), sentence, ("chat",))
-    players = trial.named_players()
+    players = trial.named_players() or (("player_0",) if trial.game == TALK else ())
     talk = (*players, *(chat.partners or (AI,)))
     if chat.first is not None and (players or chat.partners) and chat.first not in talk:
         hint = did_you_mean(chat.first, talk) or f"; there are {values.printable(', '.join(talk), 100)}"
