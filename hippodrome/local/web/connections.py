@@ -68,6 +68,13 @@ class HttpConnection(H11Protocol):
         self._arm(HEADER_SECONDS)
         super().on_response_complete()
 
+    def shutdown(self) -> None:
+        """Close the connection since the server ends; if a request is being answered, after the answer."""
+        if self.waits and self.cycle is not None and not self.cycle.response_complete:
+            self.transport.abort()  # its body has not come: uvicorn would wait for it, and print a traceback
+        else:
+            super().shutdown()
+
     @property
     def address(self) -> str:
         """The client's IPv4 address."""

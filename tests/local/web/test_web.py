@@ -434,6 +434,17 @@ def test_many_slow_connections_do_not_block_others(site: Site, monkeypatch: pyte
             each.close()
 
 
+def test_an_unfinished_body_does_not_hold_up_the_end(capsys: pytest.CaptureFixture[str]) -> None:
+    site = Site()
+    with raw(site) as slow:
+        slow.sendall(UNFINISHED.replace(b"10000000", b"100000"))
+        until(lambda: site.server.connections)
+        site.http.close()
+        site.server.close()
+        assert ends(slow)
+    assert capsys.readouterr().err == ""
+
+
 def test_one_address_of_another_machine_has_a_share_of_the_connections(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
