@@ -218,7 +218,7 @@ class TrialSection(Section):
         Ui,
         Ui(left=True, right=True, up=True, down=True, start=True, pause=True),
         "Which controls are shown; see [ui](#ui).",
-        otherwise="`left`, `right`, `up`, `down`, `start` and `pause`",
+        otherwise="`left`, `right`, `up`, `down`, `start` and `pause`; with `game: talk` only `start`",
     )
     record_observations: bool = keyed.flag(
         False,
@@ -437,11 +437,13 @@ class TrialSection(Section):
     )
 
     def as_talk(self) -> TrialSection:
-        """Return the section of the game `talk`, with its defaults: one episode, a step each second, and `chat`."""
+        """Return the section of the game `talk`, with its defaults: one episode, a step each second, `chat`, and no
+        control but `start`: a pause by one participant would stop the clock of all."""
         rate = self.starting_frame_rate if self.given("startingFrameRate") else 1
         episodes = self.max_episodes if self.given("maxEpisodes") else 1
         chat = self.chat or ChatSection()
-        return dataclasses.replace(self, starting_frame_rate=rate, max_episodes=episodes, chat=chat)
+        ui = self.ui if self.given("ui") else Ui(start=True)
+        return dataclasses.replace(self, starting_frame_rate=rate, max_episodes=episodes, chat=chat, ui=ui)
 
     @property
     def between_seconds(self) -> float:

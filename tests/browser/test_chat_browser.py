@@ -627,10 +627,12 @@ def test_offers_are_fields_of_the_page_between_two_rounds(
     tell(only_talk.world, state="break", episodeScore=0)
     tab.wait_for_selector("#overlay-title:text('Round 1 of 3 is over')")
     assert tab.inner_text("#overlay-score") == ""
+    assert tab.inner_text("#announce") == "Round 1 of 3 is over", "what a screen reader says"
     shot(tab, f"{width}-talk-break")
     tab.evaluate("window.letGo()")
     tab.wait_for_selector("text=Your offer")
     assert tab.inner_text("#reading-score").strip() == "Round 1 of 3 is over."
+    assert tab.eval_on_selector("#reading", "page => page.offsetWidth") > min(700, width - 60)
     tab.fill("[name=apples]", "4")
     shot(tab, f"{width}-talk-offer")
     assert tab.evaluate(FLAWS) == []

@@ -83,6 +83,7 @@ async def test_a_game_of_words_alone_needs_no_environment_and_no_picture(launch,
         assert await client.read(2) == [("player_0", "Hi"), ("ai", "warm: 1")]
         assert client.controls["chat"]["with"] == ["ai"]
         assert client.controls["frameRate"] == 1
+        assert client.controls["UI"] == ["start"]
         assert await client.closed() == 1000
     answers = server.answer()["answers"]
     assert (answers["episodes"], answers["talk"]["lines"]) == (1, 1)
