@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from hippodrome.control.model.project import Project
 from hippodrome.export import scrub
 from hippodrome.export.design_columns import Design, assignment_in, is_answer
-from hippodrome.export.keys import ENDED
+from hippodrome.export.keys import ASSIGNED, ENDED
 from hippodrome.export.page_fields import FieldKind
 from hippodrome.export.recording_columns import as_number, as_whole, when
 from hippodrome.export.scrub import clean
@@ -143,7 +143,14 @@ class StudyAnswers:
                 yield participant, found
                 continue
             hide = scrub.Scrub(scrub.identities(participant))
-            yield participant, {step: hide.value(answers) for step, answers in found.items()}
+            yield (
+                participant,
+                # An assignment and an end hold words of the study alone.
+                {
+                    step: document if step in (ASSIGNED, ENDED) else hide.value(document)
+                    for step, document in found.items()
+                },
+            )
             self.scrubbed += hide.found
 
     def _count_page(self, counts: Counter[str], step: str, answers: Mapping[str, Any]) -> None:

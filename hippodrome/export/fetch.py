@@ -241,8 +241,8 @@ class Fetcher:
         else:
             column, identities, people = {"session": owner.session}, dict(owner.identities), owner.people
         folder, label = _folder(owner), item.server.rpartition("-")[0]
-        names = identities | {item.server: place} | ({label: "(server)"} if label else {})
-        hide = scrub.Scrub(names if self._wanted.apart else {})
+        servers = {item.server: place} | ({label: "(server)"} if label else {})
+        hide = scrub.Scrub(identities, servers) if self._wanted.apart else scrub.Scrub({})
         packed, made = self._temporary(), self._temporary()
         try:
             self._source.fetch(item.listed, packed)

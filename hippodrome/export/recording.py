@@ -18,7 +18,7 @@ from typing import Any
 
 from hippodrome.export.recording_columns import Rows, as_number, as_text, as_whole, players_of, seats_of
 from hippodrome.export.recording_lines import lines
-from hippodrome.export.scrub import Scrub
+from hippodrome.export.scrub import Scrub, clean
 from hippodrome.protocol.players import MAX_PLAYERS
 
 SCHEMA = 1
@@ -66,6 +66,7 @@ def convert(
     playing = None if people is None else {name: people.get(seat) for name, seat in seats_of(head).items()}
     if playing is not None:
         constants = {**constants, **{f"participant.{name}": number for name, number in playing.items()}}
+    scrub = scrub.sparing(players_of(head))
     rows = Rows(constants, scrub, players_of(head), None if playing is None else tuple(playing))
     with pq.ParquetWriter(target, rows.schema, compression="zstd") as writer:
         versions: set[int] = set()
@@ -76,7 +77,7 @@ def convert(
                 versions.add(version)
             if kind == "header" and not header:
                 header = line
-                rows.trial = as_text(line.get("trial"))
+                rows.trial = as_text(scrub.value(line.get("trial")))
                 continue
             if not isinstance(kind, str):
                 done.problems.append("a line without a kind is kept as it is")
@@ -97,7 +98,12 @@ def convert(
         metadata = {
             "schema": SCHEMA,
             "complete": done.complete,
-            "header": {name: scrub.value(value) for name, value in header.items() if name not in hidden},
+            "header": {
+                # The header is the study's; the trial's id may be the server's name.
+                name: scrub.value(value) if name == "trial" else value
+                for name, value in header.items()
+                if name not in hidden
+            },
         }
         writer.add_key_value_metadata({"hippodrome": json.dumps(metadata)})
     done.problems[:] = _summed(done.problems + rows.problems)
@@ -106,7 +112,7 @@ def convert(
     for episode in done.episodes:
         episode["score"] = episode["score"] if math.isfinite(episode["score"]) else None
         episode["scores"] = {name: score for name, score in episode["scores"].items() if math.isfinite(score)}
-        episode["players"] = _who_plays(header, scrub)
+        episode["players"] = _who_plays(header)
         episode["forms"] = {player: scrub.value(fields) for player, fields in episode["forms"].items()}
         if playing is not None:
             episode |= {"session": constants.get("session"), "people": playing}
@@ -191,13 +197,13 @@ def _add_players(episode: dict[str, Any], players: Any) -> None:
             by_policy[name] = by_policy.get(name, 0) + 1
 
 
-def _who_plays(header: Mapping[str, Any], scrub: Scrub) -> dict[str, str | None]:
+def _who_plays(header: Mapping[str, Any]) -> dict[str, str | None]:
     """Who plays each player: `human`, or the policy or program as in config.yml."""
     kinds = {}
     for name in players_of(header):
         player = header["players"].get(name)
         kind = player.get("policy", player.get("kind")) if isinstance(player, Mapping) else None
-        kinds[name] = scrub.text(kind) if isinstance(kind, str) else None
+        kinds[name] = clean(kind) if isinstance(kind, str) else None
     return kinds
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any
 
-from hippodrome.export.scrub import Scrub
+from hippodrome.export.scrub import Scrub, clean
 from hippodrome.export.table_files import json_text
 from hippodrome.protocol.players import MAX_PLAYERS
 
@@ -177,7 +177,8 @@ class Rows:
         return self.waiting >= GROUP_ROWS or self._bytes >= GROUP_BYTES
 
     def add(self, line: Mapping[str, Any]) -> None:
-        """Add a row for a line of the recording."""
+        """Add a row for a line of the recording, without identities."""
+        line = self._scrub.record(line)
         columns = self._columns
         other = {name: value for name, value in line.items() if name not in _TYPED and name not in _NOT_STORED}
         kind = line.get("kind")
@@ -227,7 +228,7 @@ class Rows:
 
         columns = self._columns
         for name in (*_TEXTS, *(f"by.{player}" for player in self._players)):
-            columns[name] = [None if text is None else self._scrub.text(text) for text in columns[name]]
+            columns[name] = [None if text is None else clean(text) for text in columns[name]]
         for name in ("participant", *self._constants):
             columns[name] = [self._constants.get(name)] * self.waiting
         made = pa.table([pa.array(columns[f.name], f.type) for f in self.schema], schema=self.schema)

@@ -54,7 +54,8 @@ def document(
     if piece.get("schema") != SCHEMA or not isinstance(records, list) or not isinstance(seats, list):
         raise ValueError("it is no piece of a tape that this version can read")
     playing = {str(player): people[seat] for seat, player in enumerate(seats) if seat in people}
-    kept = [hide.value(record) for record in records if isinstance(record, Mapping)]
+    hide = hide.sparing(list(map(str, seats)))
+    kept = [hide.record(record) for record in records if isinstance(record, Mapping)]
     return {**where, "people": playing, "records": kept}
 
 

@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from hippodrome.export.scrub import SHORTEST, Scrub
+from hippodrome.export.scrub import Scrub
 
 ERASED = {"text": "", "erased": True}
 
@@ -22,16 +22,16 @@ def without_member(piece: bytes, seat: int, user: str) -> bytes:
     """
     try:
         found = json.loads(piece)
-        records, player = list(found["records"]), str(found["seats"][seat])
+        records, seats = list(found["records"]), [str(player) for player in found["seats"]]
+        player = seats[seat]
     except (ValueError, KeyError, TypeError, IndexError):
         return b'{"schema":1,"records":[]}'
-    hide = Scrub({user: ""}) if len(user) >= SHORTEST else None
-    left = [_without(record, player) for record in records]
-    found["records"] = left if hide is None else hide.value(left)
+    hide = Scrub({user: ""}).sparing(seats)
+    found["records"] = [hide.record(_without(record, player)) for record in records]
     return piece if found == json.loads(piece) else json.dumps(found, separators=(",", ":")).encode()
 
 
-def _without(record: Any, player: str) -> Any:
+def _without(record: Any, player: str) -> Mapping[str, Any]:
     if not isinstance(record, Mapping):
         return {}
     if record.get("kind") == "line" and record.get("by") == player:

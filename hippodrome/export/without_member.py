@@ -1,8 +1,8 @@
 """Removes the data of one member from a session's recording, for the erasure of that participant.
 
 It removes the member's messages (with feedback and key presses), the times of key presses, the actions of their keys,
-their round trips, the lines on their presence, the lines of callbacks on them, their outcome, and their id in any
-place. The actions, rewards and scores of their player stay: without them the game of the others cannot be read or
+their round trips, the lines on their presence, the lines of callbacks on them, their outcome, and their id as a
+word of any text (`scrub.py`). The actions, rewards and scores of their player stay: without them the game of the others cannot be read or
 repeated. Lines without data of the member stay byte for byte.
 """
 
@@ -58,10 +58,12 @@ class _Erased:
         players = {name for name, of in recording_columns.seats_of(header).items() if of == seat}
         self._players: Collection[str] | None = players if header.get("kind") == "header" else None  # None: unknown
         self._id = user.lower().encode() if len(user) >= SHORTEST else None
-        self._hide = Scrub({user: ""})
+        self._hide = Scrub({user: ""}).sparing(recording_columns.players_of(header))
 
     def without(self, line: Mapping[str, Any], text: bytes) -> dict[str, Any] | None:
         """Return the line without the member's data; None if it is only about them. `text` is the line as written."""
+        if line.get("kind") == "header":
+            return dict(line)  # it is the study's: no participant has sent a word of it
         if self._is_theirs(line):
             return None
         left = dict(line)
@@ -70,14 +72,14 @@ class _Erased:
         for name in OF_EACH:
             if isinstance(values := line.get(name), Mapping):
                 left[name] = {player: value for player, value in values.items() if not self._is(player)}
-        if isinstance(players := line.get("players"), Mapping) and line.get("kind") != "header":
+        if isinstance(players := line.get("players"), Mapping):
             left["players"] = {
                 player: _without_keys(part) if self._is(player) else part for player, part in players.items()
             }
         if self._is(self._first) and line.get("human") is not None:
             left["human"] = None
         if self._id is not None and self._id in text.lower():
-            left = self._hide.value(left)
+            left = self._hide.record(left)
         return left
 
     def _is(self, player: Any) -> bool:

@@ -481,10 +481,13 @@ def test_with_identities_apart_only_private_files_name_participants(tmp_path: Pa
     for user in users:
         about = made_of.participant(user)
         words = f"I am {user.upper()} ({about['link']['PROLIFIC_PID']}), code {about['completionCode']}"
-        arrive(put, user, {"2": {"words": words, f"field-of-{user}": [user, words]}})
+        arrive(put, user, {"2": {"words": words, "field": [user, words]}})
         told = {"user": user, "pid": about["link"]["PROLIFIC_PID"], "server": server(user)}
         error = f"no such file /home/{user}/x"
-        put(recording_key(user, "3-episode-0009"), record(tmp_path, user, messages=[told], error=error, more={user: 1}))
+        put(
+            recording_key(user, "3-episode-0009"),
+            record(tmp_path, user, messages=[told], error=error, more={"of": user}),
+        )
         put(recording_key(user, "3-episode-0008"), record(tmp_path, user)[:200])
         put(key(user, f"{user}.txt"), b"?")
         put(key(user, f"trials/{user}-7/3-trial.jsonl.gz"), record(tmp_path, user))

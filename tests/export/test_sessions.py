@@ -175,7 +175,8 @@ def test_a_member_who_was_erased_is_no_ones_in_tables_and_the_other_stays(place:
 def test_with_identities_apart_only_private_files_hold_members_data(place: Place) -> None:
     study(place.put, place.tmp)
     told = [ANN, BOB, f"prolific-of-{ANN}", f"prolific-of-{BOB}"]
-    made = [line.replace(b"words-of-annabel", f"I am {' and '.join(told)}".encode()) for line in lines()]
+    typed = f'"fields":{{"said":"I am {" and ".join(told)}"}}'.encode()
+    made = [line.replace(b'"key":"words-of-annabel"', typed) for line in lines()]
     place.put(recording_key(), packed(place.tmp, made))
     place.done("--format", "csv,parquet", "--identities", "apart")
     for path in place.out.rglob("*"):
@@ -188,6 +189,23 @@ def test_with_identities_apart_only_private_files_hold_members_data(place: Place
     left = {row["participant.left"] for row in table(place.out)}
     assert left == {who[ANN]}
     assert f"I am {who[ANN]} and {who[BOB]} and (PROLIFIC_PID)" in str(table(place.out, "messages"))
+
+
+def test_with_identities_apart_link_values_that_are_words_of_the_format_change_no_recording(place: Place) -> None:
+    study(place.put, place.tmp)
+    head = {name: {"kind": "human", "seat": seat} for seat, name in enumerate(("left", "right-player"))}
+    made = [line.replace(b'"right"', b'"right-player"') for line in lines(observe=True, head=head)]
+    place.put(recording_key(), packed(place.tmp, made))
+    words = ("episode", "callback", "policy", "terminated", "messages", "player", "right-player", "on_tick")
+    file = place.data / key(BOB, "participant.json")
+    document = json.loads(file.read_text())
+    found = []
+    for more in ({}, {f"x{n}": word for n, word in enumerate(words)}):
+        file.write_text(json.dumps({**document, "link": {**document["link"], **more}}))
+        place.done("--format", "csv,parquet", "--identities", "apart")
+        found.append((table(place.out), [row["score"] for row in place.rows("episodes")]))
+    assert found[0] == found[1]
+    assert {row["kind"] for row in found[1][0]} == {"reset", "step", "presence", "ping", "callback", "end"}
 
 
 @pytest.mark.parametrize("wrong", [{"seat": 2**63}, {"waited": 2**53 + 1}, {"waited": 10**400}])

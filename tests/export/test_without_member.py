@@ -143,3 +143,52 @@ def test_damaged_recordings_keep_nothing_of_the_member(noise: bytes, at: int, in
     for line in filter(None, found.split(b"\n")):
         for message in json.loads(line).get("messages") or ():
             assert message["player"] != "left"
+
+
+# An id may be any word of letters, digits, dashes and underscores: also one of the format's
+
+
+@pytest.mark.parametrize(
+    "user",
+    [
+        "header",
+        "rewards",
+        "player",
+        "players",
+        "answer",
+        "terminated",
+        "callback",
+        "on_tick",
+        "human_0",
+        "float32",
+        "uint8",
+    ],
+)
+def test_an_id_that_is_a_word_of_the_format_leaves_the_others_data_as_they_are(tmp_path: Path, user: str) -> None:
+    more = [
+        recording.line("step", episode=1, step=7, info={"rewards": {"human_0": 1.0}, "answer": [True], "player": 3}),
+        recording.line("presence", episode=1, step=7, player="right", what="left"),
+        recording.line("end", episode=1, why="terminated", outcomes={"right": "completed"}),
+    ]
+    body = packed(tmp_path, [*lines(observe=True), *more])
+    usual, _ = without(tmp_path, body, user="annabel-0043")
+    left, _ = without(tmp_path, body, user=user)
+    assert recording.read(left) == recording.read(usual)
+
+
+@pytest.mark.parametrize("name", ["player_0", "left-player"])
+def test_an_id_that_is_the_name_of_a_player_stays_where_it_names_the_player(tmp_path: Path, name: str) -> None:
+    head = {"other": {"kind": "human", "seat": 0}, name: {"kind": "human", "seat": 1}}
+    line = recording.line(
+        "step", episode=1, step=1, info={"leader": name}, toAct=[name], players={name: {"reward": 1.0}}
+    )
+    left, _ = without(tmp_path, packed(tmp_path, [*lines(head=head)[:1], line]), 0, name)
+    assert line in gzip.decompress(left)
+
+
+def test_the_id_leaves_a_sentence_of_another_member_and_no_longer_word(tmp_path: Path) -> None:
+    form = {"page": ANN, "fields": {"who": f"It was {ANN.upper()}, or\n{ANN}!", ANN: f"{ANN}-2"}}
+    line = recording.line("break", episode=1, why="over", messages=[{"ns": 1, "player": "right", "form": form}])
+    left, _ = without(tmp_path, packed(tmp_path, [*lines(), line]))
+    (message,) = recording.read(left)[-1]["messages"]
+    assert message["form"] == {"page": ANN, "fields": {"who": "It was , or\n!", ANN: f"{ANN}-2"}}

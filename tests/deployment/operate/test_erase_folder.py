@@ -26,9 +26,11 @@ from hippodrome.control.model.server import Server, ServerState
 from hippodrome.deployment.operate import folder_eraser
 from hippodrome.deployment.operate.data_folder import DataFolder
 from hippodrome.deployment.operate.folder_eraser import FolderEraser
+from hippodrome.deployment.operate.session_eraser import SessionEraser
 from hippodrome.protocol.handover import Handover
 from hippodrome.protocol.keys import handover_key, session_key
 from hippodrome.protocol.session import parse
+from hippodrome.trial.recordings import recording
 from tests.deployment.installation import CommandResult
 from tests.export.data_world import crowd, into_folder
 from tests.export.session_world import ANN, BOB, SID, pair, recording_key, said, session, study, tape, tape_key
@@ -103,6 +105,40 @@ def test_what_one_member_has_said_is_erased_also_in_the_requests_to_a_model(mach
     assert (first["n"], first["by"], first["text"], held["text"]) == (1, "left", "", "")
     assert (call["hash"], call["tokens"], "request" in call) == ("abc", {"input": 9, "output": 2}, False)
     assert (answer["text"], other["text"], other["original"]) == ("Hello", said(BOB), "Rude")
+
+
+@pytest.mark.parametrize("user", ["header", "rewards", "player", "answer", "records", "left", "player_0"])
+def test_an_id_that_is_a_word_of_the_format_destroys_no_data_of_the_others(tmp_path: Path, user: str) -> None:
+    put = into_folder(tmp_path / "data")
+    pair(put, tmp_path, members=(user, BOB))
+    put(tape_key(), tape((user, BOB)))
+    before = recording.read((tmp_path / "data" / recording_key()).read_bytes())
+    SessionEraser(DataFolder(tmp_path / "data"), "maze", user).leave_sessions()
+    after = recording.read((tmp_path / "data" / recording_key()).read_bytes())
+    assert after[0] == before[0]
+    for wanted, found in zip(steps(before), steps(after), strict=True):
+        assert found["players"]["right"] == wanted["players"]["right"]
+        assert (found["reward"], found["info"], found["extra"]) == (wanted["reward"], wanted["info"], wanted["extra"])
+        assert found["messages"] == [message for message in wanted["messages"] if message["player"] == "right"]
+    told = json.loads((tmp_path / "data" / tape_key()).read_bytes())
+    assert [(record["kind"], record.get("by")) for record in told["records"]] == [
+        ("line", "left"), ("call", None), ("line", "ai"), ("line", "right"), ("line", "left"),
+    ]  # fmt: skip
+    assert [record["text"] for record in told["records"] if "text" in record] == ["", "Hello", said(BOB), ""]
+
+
+def steps(made: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [line for line in made if line["kind"] == "step"]
+
+
+def test_the_id_is_erased_from_what_another_member_has_said(machine: Machine) -> None:
+    study(machine.put, machine.tmp)
+    piece = json.loads(tape())
+    piece["records"][3]["text"] = f"Are you {ANN}? {said(BOB)}"
+    machine.put(tape_key(), json.dumps(piece).encode())
+    assert machine.erase("--yes").code == Exit.DONE
+    assert machine.traces() == []
+    assert json.loads(machine.contents()[tape_key()])["records"][3]["text"] == f"Are you ? {said(BOB)}"
 
 
 def test_after_all_members_are_erased_the_session_is_deleted(machine: Machine) -> None:
