@@ -15,8 +15,31 @@ from hippodrome.export.state import ExportedParticipant
 
 SHORTEST = 6  # characters; a shorter identity would be found in too many texts by chance
 OWN_FIELDS = frozenset(
-    "kind player by to toAct standIns callback name what why limit outcomes command event action key page actionName "
-    "time hash path model method".split()
+    {
+        "kind",
+        "player",
+        "by",
+        "to",
+        "toAct",
+        "standIns",
+        "callback",
+        "name",
+        "what",
+        "why",
+        "limit",
+        "outcomes",
+        "command",
+        "event",
+        "action",
+        "key",
+        "page",
+        "actionName",
+        "time",
+        "hash",
+        "path",
+        "model",
+        "method",
+    }
 )
 """Fields of a recording's lines, of messages in them, and of a tape's records, with words of the format or of the study
 alone: no participant writes a sentence there."""

@@ -1,9 +1,9 @@
 """Removes the data of one member from a session's recording, for the erasure of that participant.
 
 It removes the member's messages (with feedback and key presses), the times of key presses, the actions of their keys,
-their round trips, the lines on their presence, the lines of callbacks on them, their outcome, and their id as a
-word of any text (`scrub.py`). The actions, rewards and scores of their player stay: without them the game of the others cannot be read or
-repeated. Lines without data of the member stay byte for byte.
+their round trips, the lines on their presence, the lines of callbacks on them, their outcome, and their id where it is
+a word of a text (`scrub.py`). The actions, rewards and scores of their player stay: without them the game of the others
+cannot be read or repeated. Lines without data of the member stay byte for byte.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -161,12 +162,12 @@ def test_damaged_recordings_keep_nothing_of_the_member(noise: bytes, at: int, in
         "on_tick",
         "human_0",
         "float32",
-        "uint8",
     ],
 )
 def test_an_id_that_is_a_word_of_the_format_leaves_the_others_data_as_they_are(tmp_path: Path, user: str) -> None:
+    seen = recording.observation(np.zeros(2, np.float32))
     more = [
-        recording.line("step", episode=1, step=7, info={"rewards": {"human_0": 1.0}, "answer": [True], "player": 3}),
+        recording.line("step", episode=1, step=7, info={"rewards": {"human_0": 1.0}, "answer": seen, "player": 3}),
         recording.line("presence", episode=1, step=7, player="right", what="left"),
         recording.line("end", episode=1, why="terminated", outcomes={"right": "completed"}),
     ]

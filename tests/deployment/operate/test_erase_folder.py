@@ -33,7 +33,20 @@ from hippodrome.protocol.session import parse
 from hippodrome.trial.recordings import recording
 from tests.deployment.installation import CommandResult
 from tests.export.data_world import crowd, into_folder
-from tests.export.session_world import ANN, BOB, SID, pair, recording_key, said, session, study, tape, tape_key
+from tests.export.session_world import (
+    ANN,
+    BOB,
+    SID,
+    lines,
+    packed,
+    pair,
+    recording_key,
+    said,
+    session,
+    study,
+    tape,
+    tape_key,
+)
 
 LABEL = ids.server_label("maze", ANN)
 
@@ -111,6 +124,8 @@ def test_what_one_member_has_said_is_erased_also_in_the_requests_to_a_model(mach
 def test_an_id_that_is_a_word_of_the_format_destroys_no_data_of_the_others(tmp_path: Path, user: str) -> None:
     put = into_folder(tmp_path / "data")
     pair(put, tmp_path, members=(user, BOB))
+    made = [line.replace(b'"info":{"t":', b'"info":{"rewards":') for line in lines((user, BOB))]
+    put(recording_key(), packed(tmp_path, made))
     put(tape_key(), tape((user, BOB)))
     before = recording.read((tmp_path / "data" / recording_key()).read_bytes())
     SessionEraser(DataFolder(tmp_path / "data"), "maze", user).leave_sessions()
@@ -124,6 +139,7 @@ def test_an_id_that_is_a_word_of_the_format_destroys_no_data_of_the_others(tmp_p
     assert [(record["kind"], record.get("by")) for record in told["records"]] == [
         ("line", "left"), ("call", None), ("line", "ai"), ("line", "right"), ("line", "left"),
     ]  # fmt: skip
+    assert told["records"][1]["answer"] == {"x": 1}
     assert [record["text"] for record in told["records"] if "text" in record] == ["", "Hello", said(BOB), ""]
 
 
