@@ -9,7 +9,7 @@ from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.config import Config
 from hippodrome.local.fake_model import FakeModel
 from hippodrome.protocol import environment
-from hippodrome.protocol.trial_llm import is_loopback
+from hippodrome.protocol.loopback import is_loopback
 
 _NO_KEY = "LLM_KEY is not set, so a stand-in answers in the place of the language model: it repeats what it reads"
 

@@ -10,13 +10,13 @@ from urllib.parse import urlsplit
 
 from hippodrome.protocol import section_keys as keyed
 from hippodrome.protocol import values
+from hippodrome.protocol.loopback import LOOPBACK
 from hippodrome.protocol.section_keys import Section
 
 MAX_MODELS = 20
 MAX_PROMPT = 2_000  # characters of a prompt in config.yml; a file may be longer
 MAX_PROMPT_FILE = 64 * 1024
 """The most bytes of a prompt's file."""
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _PROMPT_FILES = (".txt", ".md")
 
@@ -36,11 +36,6 @@ def _url(value: object) -> str:
     if parts.scheme == "http" and host not in LOOPBACK:
         raise ValueError("must begin with https://, so that nobody on the way reads the key and what people say")
     return url
-
-
-def is_loopback(url: str) -> bool:
-    """Return whether the model at this address runs on the same machine."""
-    return urlsplit(url).hostname in LOOPBACK
 
 
 def _prompt(value: object) -> str:

@@ -158,7 +158,7 @@ def test_if_one_participant_leaves_for_good_the_game_ends_and_the_other_goes_on(
 
     report = asyncio.run(asyncio.wait_for(leave(), PATIENCE))
     assert (report.finished, report.errors, report.plays[0].outcome) == (True, [], "partnerLeft")
-    assert ["has not come back" in trouble for trouble in report.troubles] == [True]
+    assert ["Another participant left" in trouble for trouble in report.troubles] == [True]
     assert document(study.data / PROJECT / "users/bo/answers/3.json")["answers"]["outcome"] == "left"
     assert verify(study.data, PROJECT, [report]).missing == []
 

@@ -11,7 +11,7 @@ from hippodrome.control.model import design, hippo_entry, ids
 from hippodrome.control.model.design import Assignment, Block, End, Factor, Step
 from hippodrome.control.model.matching import MATCH
 from hippodrome.control.model.records import Record, from_data, from_json, to_json
-from hippodrome.protocol.trial_llm import is_loopback
+from hippodrome.protocol.loopback import is_loopback
 
 MASTER_LIST = "project_master_list.json"
 STEPS_FOLDER: Literal["steps"] = "steps"
