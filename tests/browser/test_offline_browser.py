@@ -80,7 +80,7 @@ def test_without_a_network_the_page_says_what_is_kept_and_what_to_do_and_it_reco
     for connection in world.connections:
         connection.socket.close()  # Chromium keeps a WebSocket to this machine
     lone_tab.wait_for_function(
-        "() => ['connection', 'trying again', 'stay on this page', 'another network'].every(each => document.body.innerText.toLowerCase().includes(each))"
+        "() => ['connection', 'trying again', 'stay on this page', 'mobile data'].every(each => document.body.innerText.toLowerCase().includes(each))"
     )
     assert re.search(r"Your (answers are|game is) (safe|saved)", lone_tab.inner_text("main"))
     assert lone_tab.evaluate("[document.documentElement.scrollWidth - innerWidth]") == [0]

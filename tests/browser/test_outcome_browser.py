@@ -135,7 +135,10 @@ def test_a_choice_without_a_button_is_said_in_words(dilemma: World, phone: Any) 
 
 @pytest.mark.parametrize(
     ("labels", "words"),
-    [({}, "Time ran out before you chose."), ({"noop": "Stay"}, "Time ran out, so “Stay” was chosen for you.")],
+    [
+        ({}, ("Time ran out before you made a choice.")),
+        ({"noop": "Stay"}, "Time ran out, so “Stay” was chosen for you."),
+    ],
     ids=["no label", "label"],
 )
 def test_the_idle_action_has_no_name_for_participants_unless_the_study_gives_it_one(

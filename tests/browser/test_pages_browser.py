@@ -622,7 +622,7 @@ def test_the_end_shows_the_last_picture_with_the_score_for_four_seconds(world: W
     wait_for_next_page(tab, within=4_000)
 
 
-FAILED = "Something went wrong, so the game ends here. What you have played so far is saved."
+FAILED = "Something went wrong, so the game ends here. Everything so far is saved."
 
 
 @pytest.mark.parametrize("own", [None, "Das Spiel ging kaputt."])
@@ -779,7 +779,7 @@ def test_the_page_says_what_may_help_if_the_server_cannot_be_reached(world: Worl
     world.state["url"] = NOWHERE
     lone_tab.clock.install()
     lone_tab.goto(world.url)
-    lone_tab.wait_for_selector("#overlay-hint:text('try another network')")
+    lone_tab.wait_for_selector("#overlay-hint:text('try Wi-Fi or mobile data')")
     assert lone_tab.inner_text("#overlay-title") == "Loading the game…", "no connection was there to lose"
     world.ready()
     lone_tab.clock.run_for(10_000)

@@ -202,7 +202,7 @@ def test_the_words_at_the_end_of_a_game_that_failed_fit_a_phone(
     world: World, phone: Any, size: tuple[int, int]
 ) -> None:
     play(world, phone, size, {}, ALL)
-    failed = "Something went wrong, so the game ends here. What you have played so far is saved."
+    failed = "Something went wrong, so the game ends here. Everything so far is saved."
     world.connections[0].send(json.dumps({"done": True, "score": 21, "episodes": 1, "error": failed}))
     phone.wait_for_selector("#overlay-hint:visible:text('ends here')")
     shot(phone, f"{size[0]}-failed")

@@ -672,7 +672,9 @@ def test_the_server_is_told_when_the_instructions_are_read(group: World, stopped
     group.wait_for({"command": "start"})
     tab.wait_for_selector("#overlay-title:text('Waiting for the other participant'):visible")
     assert players_shown(tab) == ["You: Blue", "Red (reading)"]
-    assert "They are still reading. The game will start in 18 seconds at the latest." in tab.inner_text("#overlay-hint")
+    assert "Not everyone has finished reading. The game will start within 18 seconds." in tab.inner_text(
+        "#overlay-hint"
+    )
 
 
 def test_instructions_that_were_read_before_a_reload_are_not_shown_again(group: World, stopped_clock_tab: Any) -> None:

@@ -43,7 +43,7 @@ _PAGES = {
     ),
     "missing": "Please answer this question: “{question}”",
     "answerHere": "Please answer this question.",
-    "lookAgain": "Please check this answer: “{question}”",
+    "lookAgain": "Please check your answer to “{question}”",
     "tooLong": "Your answers are too long to send. Please contact the researchers who invited you.",
     "shorten": "Your answers are too long to send. Please shorten your answer to “{question}”. Nothing has been lost.",
     "shortenBy": (
@@ -64,16 +64,14 @@ _PAGES = {
     "triesOne": "You have one attempt left.",
     "triesSome": "You have {number} attempts left.",
     "endTitle": "Thank you",
-    "endText": "This is the end of the study for you.",
+    "endText": "Your part in the study ends here.",
     "endCode": "Your code:",
     "endLink": "Finish",
 }
 _WAITING = {
     "waitingForGame": "Waiting for the game",
     "gettingReady": "Preparing your game",
-    "startingAlone": (
-        "We are starting a game server just for you. Please wait: the game will appear on this page automatically."
-    ),
+    "startingAlone": ("We are getting your game ready. Please wait: the game will appear on this page automatically."),
     "startingTogether": (
         "We are starting the server for your game. Please wait: the game will appear on this page automatically."
     ),
@@ -90,8 +88,8 @@ _WAITING = {
     ),
     "noConnection": (
         "No connection. Trying again… Your answers are safe. Please stay on this page; it will continue "
-        "automatically. If this lasts more than a few minutes, try another network or contact the researchers who "
-        "invited you."
+        "automatically. If this takes more than a few minutes, try Wi-Fi or mobile data, or "
+        "contact the researchers who invited you."
     ),
     "needsScript": (
         "The game needs JavaScript, which is turned off in this browser. Please turn it on, or open your study "
@@ -116,11 +114,11 @@ _ENDED = {
     "failedTitle": "The game could not start",
     "lostTitle": "The game could not be played",
     "fullTitle": "The study is full right now",
-    "stopped": "The researchers stopped the server for your game.",
+    "stopped": "The researchers ended your game.",
     "deadline": "The time limit was reached.",
     "idle": "The game was inactive for too long, or its time limit was reached, so it was closed.",
     "failed": "The game did not work on any of the servers we tried. This is not your fault.",
-    "refused": "A problem with the study’s setup prevents your game from starting. This is not your fault.",
+    "refused": "Your game cannot start because of a problem with the study’s setup. This is not your fault.",
     "noCapacity": "No server is available for your game right now. This is not your fault.",
     "full": "All places in this game are taken right now. This is not your fault.",
     "computerGone": "The game server has stopped.",
@@ -192,7 +190,7 @@ _GAME = {
     "othersTurn": "The others’ turn",
     "youChose": "You chose “{action}”.",
     "timeUp": "Time ran out, so “{action}” was chosen for you.",
-    "timeUpIdle": "Time ran out before you chose.",
+    "timeUpIdle": "Time ran out before you made a choice.",
     "timeUpEnds": "Time ran out, so this game has ended.",
     "gameOver": "Game {game} of {games} is over",
     "nextGameIn": "The next game starts in {time}.",
@@ -204,8 +202,8 @@ _GAME = {
     "hangs": "Your connection is slow. Please stay on this page.",
     "lost": "Connection lost. Trying again…",
     "lostNote": (
-        "Your game is safe. Please stay on this page; it will continue automatically. If this lasts more than a "
-        "few minutes, try another network or contact the researchers who invited you."
+        "Your game is safe. Please stay on this page; it will continue automatically. If this takes more than a "
+        "few minutes, try Wi-Fi or mobile data, or contact the researchers who invited you."
     ),
     "elsewhere": "The game is open in another tab or on another device",
     "elsewhereNote": "If you have closed it there, continue here.",
@@ -216,7 +214,7 @@ _GAME = {
     "savedMoment": "Your game is saved. Just a moment…",
     "savedOffline": (
         "Your game is saved. No connection. Trying again… Please stay on this page; it will continue "
-        "automatically. If this lasts more than a few minutes, try another network."
+        "automatically. If this takes more than a few minutes, try Wi-Fi or mobile data."
     ),
 }
 _LOBBY = {
@@ -270,7 +268,7 @@ _TOGETHER = {
     "goesOn": "The game is about to continue",
     "beginsWithAll": "The game will start as soon as everyone is here.",
     "goesOnWithAll": "The game will continue as soon as everyone is here.",
-    "theyRead": "They are still reading. The game will start in {time} at the latest.",
+    "theyRead": "Not everyone has finished reading. The game will start within {time}.",
     "absentEnds": "If they are not here within {time}, the game will end for everyone.",
     "absentReplaced": "If they are not here within {time}, a computer player will take their place.",
     "otherWaits": "The other participant is waiting for you. Please continue within {time}.",
@@ -281,19 +279,18 @@ _TOGETHER = {
     "back": "{name} is back.",
     "theirTurn": "Turn: {names}",
     "otherSees": (
-        "The other participant can see that you are away, and the game will wait for a short time. What you have "
-        "played so far is saved. Please stay on this page. If this lasts, try another network."
+        "The other participant can see that you are away, and the game will wait for a short time. Everything so "
+        "far is saved. Please stay on this page. If this takes long, try Wi-Fi or mobile data."
     ),
     "othersSee": (
-        "The other participants can see that you are away, and the game will wait for a short time. What you have "
-        "played so far is saved. Please stay on this page. If this lasts, try another network."
+        "The other participants can see that you are away, and the game will wait for a short time. Everything so "
+        "far is saved. Please stay on this page. If this takes long, try Wi-Fi or mobile data."
     ),
     "endForAll": "End the game for everyone",
     "hasEnded": "The game has ended",
     "thanks": "Thank you!",
     "youLeft": (
-        "You were away for too long, so the game has ended. What you have played so far is saved. Please continue "
-        "with the study."
+        "You were away for too long, so the game has ended. Everything so far is saved. Please continue with the study."
     ),
     "otherLeft": (
         "The other participant left, so the game has ended. This is not your fault. Please continue with the study."
@@ -320,13 +317,13 @@ _TALK = {
     "messageTooLong": "Your message is too long. The limit is {number} characters.",
     "tooManyMessages": "You are sending messages too quickly. Please wait a moment.",
     "messageKept": "No connection. Your message is saved here and will be sent when the connection is back.",
-    "messageHeld": "Your message was not passed on.",
+    "messageHeld": "Your message was not delivered.",
     "messageRefused": "Your message could not be sent. Please try again.",
     "talkTitle": "Conversation",
     "talkWaiting": "Waiting for the conversation",
     "talkGettingReady": "Preparing your conversation",
     "talkStartingAlone": (
-        "We are starting a server just for you. Please wait: the conversation will appear on this page automatically."
+        "We are getting your conversation ready. Please wait: the conversation will appear on this page automatically."
     ),
     "talkStartingTogether": (
         "We are starting the server for your conversation. Please wait: the conversation will appear on this "
@@ -362,24 +359,25 @@ _TALK = {
     "talkEnded": "The conversation has ended",
     "talkElsewhere": "The conversation is open in another tab or on another device",
     "talkLost": (
-        "Your conversation is safe. Please stay on this page; it will continue automatically. If this lasts "
-        "more than a few minutes, try another network or contact the researchers who invited you."
+        "Your conversation is safe. Please stay on this page; it will continue automatically. If this takes more "
+        "than a few minutes, try Wi-Fi or mobile data, or contact the researchers who invited "
+        "you."
     ),
     "talkBeginsWithAll": "The conversation will start as soon as everyone is here.",
     "talkGoesOnWithAll": "The conversation will continue as soon as everyone is here.",
-    "talkTheyRead": "They are still reading. The conversation will start in {time} at the latest.",
+    "talkTheyRead": "Not everyone has finished reading. The conversation will start within {time}.",
     "talkAbsentEnds": "If they are not here within {time}, the conversation will end for everyone.",
     "talkOtherSees": (
-        "The other participant can see that you are away, and will wait for a short time. What you have said "
-        "so far is saved. Please stay on this page. If this lasts, try another network."
+        "The other participant can see that you are away, and will wait for a short time. Everything so far is "
+        "saved. Please stay on this page. If this takes long, try Wi-Fi or mobile data."
     ),
     "talkOthersSee": (
-        "The other participants can see that you are away, and will wait for a short time. What you have "
-        "said so far is saved. Please stay on this page. If this lasts, try another network."
+        "The other participants can see that you are away, and will wait for a short time. Everything so far is "
+        "saved. Please stay on this page. If this takes long, try Wi-Fi or mobile data."
     ),
     "talkYouLeft": (
-        "You were away for too long, so the conversation has ended. What you have said so far is saved. "
-        "Please continue with the study."
+        "You were away for too long, so the conversation has ended. Everything so far is saved. Please continue "
+        "with the study."
     ),
     "talkOtherLeft": (
         "The other participant left, so the conversation has ended. This is not your fault. Please continue "
@@ -391,7 +389,7 @@ _TALK = {
     ),
     "talkSavedOffline": (
         "Your conversation is saved. No connection. Trying again… Please stay on this page; it will continue "
-        "automatically. If this lasts more than a few minutes, try another network."
+        "automatically. If this takes more than a few minutes, try Wi-Fi or mobile data."
     ),
     "talkStageStarting": "Starting your server",
     "talkStageReady": "Ready",
@@ -406,11 +404,11 @@ _TALK = {
     ),
     "talkFailed": "The conversation could not start",
     "talkNotHeld": "The conversation could not take place",
-    "talkStopped": "The researchers stopped the server for your conversation.",
+    "talkStopped": "The researchers ended your conversation.",
     "talkIdle": "The conversation was inactive for too long, or its time limit was reached, so it was closed.",
     "talkNoServer": "The conversation did not work on any of the servers we tried. This is not your fault.",
     "talkNotSetUp": (
-        "A problem with the study’s setup prevents your conversation from starting. This is not your fault."
+        "Your conversation cannot start because of a problem with the study’s setup. This is not your fault."
     ),
     "talkNoCapacity": "No server is available for your conversation right now. This is not your fault.",
     "talkFull": "All places in this conversation are taken right now. This is not your fault.",
@@ -427,22 +425,22 @@ _TALK = {
     "talkRoundAgain": (
         "This round could not be resumed, so it starts again from the beginning. Your earlier rounds are saved."
     ),
-    "talkBroken": "Something went wrong, so the conversation ends here. What you have said so far is saved.",
+    "talkBroken": "Something went wrong, so the conversation ends here. Everything so far is saved.",
     "talkPartnerLeft": (
-        "Another participant left, so the conversation has ended for everyone. This is not your fault. What you "
-        "have said so far is saved. Please continue with the study."
+        "Another participant left, so the conversation has ended for everyone. This is not your fault. Everything "
+        "so far is saved. Please continue with the study."
     ),
     "talkPartnerStopped": (
-        "Another participant ended the conversation, so it is over for everyone. This is not your fault. What "
-        "you have said so far is saved. Please continue with the study."
+        "Another participant ended the conversation, so it is over for everyone. This is not your fault. "
+        "Everything so far is saved. Please continue with the study."
     ),
     "talkPartnerMissing": (
         "Another participant did not join, so the conversation cannot take place. This is not your fault. Please "
         "continue with the study."
     ),
     "talkLeft": (
-        "You were away for longer than the others could wait, so the conversation has ended for everyone. What "
-        "you have said so far is saved. Please continue with the study."
+        "You were away for too long, so the conversation has ended for everyone. Everything so far is saved. "
+        "Please continue with the study."
     ),
     "talkPing": (
         "Your connection is too slow to take part. This is not your fault: the server may be far away, or others "
@@ -532,24 +530,24 @@ SAID_ALONE = {
     "saidRoundAgain": (
         "This game could not be resumed, so it starts again from the beginning. Your earlier games are saved."
     ),
-    "saidGameFailed": "Something went wrong, so the game ends here. What you have played so far is saved.",
+    "saidGameFailed": "Something went wrong, so the game ends here. Everything so far is saved.",
 }
 SAID_TOGETHER = {
     "saidPartnerLeft": (
-        "Another participant left, so the game has ended for everyone. This is not your fault. What you have "
-        "played so far is saved. Please continue with the study."
+        "Another participant left, so the game has ended for everyone. This is not your fault. Everything so far "
+        "is saved. Please continue with the study."
     ),
     "saidPartnerStopped": (
-        "Another participant ended the game, so it is over for everyone. This is not your fault. What you have "
-        "played so far is saved. Please continue with the study."
+        "Another participant ended the game, so it is over for everyone. This is not your fault. Everything so far "
+        "is saved. Please continue with the study."
     ),
     "saidPartnerMissing": (
         "Another participant did not join, so the game cannot be played. This is not your fault. Please continue "
         "with the study."
     ),
     "saidLeft": (
-        "You were away for longer than the others could wait, so the game has ended for everyone. What you have "
-        "played so far is saved. Please continue with the study."
+        "You were away for too long, so the game has ended for everyone. Everything so far is saved. Please "
+        "continue with the study."
     ),
     "saidPing": (
         "Your connection is too slow to play with others. This is not your fault: the game server may be far "
@@ -573,10 +571,12 @@ _LINKS = {
     "whoAreYou": "This link is incomplete",
     "whoAreYouText": "Your participant ID (userId) is missing from the link. Please open your study link again.",
     "brokenLink": "This link does not work",
-    "brokenLinkText": "Please copy the whole link from your invitation again.",
+    "brokenLinkText": "Please copy the whole link from your invitation and open it in your browser.",
     "brokenId": "Its {field} must be 1 to 64 letters, digits, hyphens or underscores.",
     "byInvitation": "This study is by invitation only",
-    "byInvitationText": "You need your personal link. Please copy the whole link from your invitation again.",
+    "byInvitationText": (
+        "You need your personal link. Please copy the whole link from your invitation and open it in your browser."
+    ),
     "pageMissing": "This page is missing",
     "pageMissingText": "It was not uploaded. Please contact the researchers who invited you.",
     "pageBroken": "This page cannot be shown",

@@ -24,20 +24,20 @@ from hippodrome.trial.core.seeds import policy_seed
 from hippodrome.trial.core.unfinished import RecordedTrial
 
 PARTNER_LEFT = (
-    "Another participant left, so the game has ended for everyone. This is not your fault. What you have played "
-    "so far is saved. Please continue with the study."
+    "Another participant left, so the game has ended for everyone. This is not your fault. Everything so far is "
+    "saved. Please continue with the study."
 )
 PARTNER_STOPPED = (
-    "Another participant ended the game, so it is over for everyone. This is not your fault. What you have "
-    "played so far is saved. Please continue with the study."
+    "Another participant ended the game, so it is over for everyone. This is not your fault. Everything so far is "
+    "saved. Please continue with the study."
 )
 PARTNER_MISSING = (
     "Another participant did not join, so the game cannot be played. This is not your fault. Please continue "
     "with the study."
 )
 LEFT = (
-    "You were away for longer than the others could wait, so the game has ended for everyone. What you have "
-    "played so far is saved. Please continue with the study."
+    "You were away for too long, so the game has ended for everyone. Everything so far is saved. Please continue "
+    "with the study."
 )
 PING = (
     "Your connection is too slow to play with others. This is not your fault: the game server may be far away, "

@@ -82,7 +82,7 @@ EPISODE_FAILED = "Something went wrong, so this game has ended. You will continu
 EPISODE_BEGINS_AGAIN = (
     "This game could not be resumed, so it starts again from the beginning. Your earlier games are saved."
 )
-TRIAL_FAILED = "Something went wrong, so the game ends here. What you have played so far is saved."
+TRIAL_FAILED = "Something went wrong, so the game ends here. Everything so far is saved."
 
 
 class Phase(Enum):

@@ -469,7 +469,7 @@ def test_the_page_of_a_closed_server_shows_the_reason(reason: Reason | None) -> 
     _, over = game(state=state, reason=reason, again=True).html.split('<section id="over"')
     text = Elements(f"<section {over}").text
     assert ("The time limit was reached." in text) is (reason == Reason.DEADLINE)
-    assert ("researchers stopped the server" in text) is (reason == Reason.STOPPED)
+    assert ("researchers ended your game" in text) is (reason == Reason.STOPPED)
     assert ("The game was inactive for too long" in text) is (reason == Reason.ENDED)
     assert ("not your fault" in text) is (state == "failed")
     assert ("No server is available" in text) is (reason == Reason.NO_CAPACITY)
@@ -508,7 +508,7 @@ def test_the_page_of_a_closed_server_says_what_happened_and_whom_to_tell(
     ("reason", "words"),
     [
         ("lost", "did not work on any of the servers"),
-        ("refused", "setup prevents your game from starting"),
+        ("refused", "Your game cannot start because of a problem"),
         ("full", "All places in this game are taken"),
         ("unheard of", "The game server has stopped."),
     ],
