@@ -161,5 +161,7 @@ def test_who_loses_the_network_at_the_end_stays_in_the_study(world: World, phone
     try:
         phone.click("#overlay-button")
         phone.wait_for_selector("#leave-text:text('No connection')")
+        with phone.expect_navigation():
+            phone.context.set_offline(False)
     finally:
         phone.context.set_offline(False)
