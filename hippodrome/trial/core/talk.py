@@ -367,7 +367,7 @@ class Talk:
 
     def _said_by(self, player: str, say: Say, text: str, fields: Mapping[str, Any]) -> None:
         typed = {} if say.typed is None else {"typed": say.typed}
-        line = self._add(player, text, self._readers(player), id=say.id, fields={**fields, **typed})
+        line = self._record(self._append(player, text, self._readers(player), id=say.id, fields={**fields, **typed}))
         self._said[player, say.id] = line
         self._types(player, False)
         circle = self._circles[player]
@@ -438,7 +438,7 @@ class Talk:
         del self._asked[ask_id]
         if line is not None:
             line.text, line.more = text or line.text, False
-            self._emit(RecordTalk(line.record()))
+            self._record(line)
         elif asked[1] is not None:
             self._emit(RecordTalk({"kind": "answered", "n": asked[1].n}))
         if not self._asked:
@@ -462,7 +462,7 @@ class Talk:
         if not text or (len(times) == AGENT_RATE and now - times[0] < 1.0):
             return not text
         times.append(now)
-        line = self._add(by, text, None if to is None else tuple(to))
+        line = self._record(self._append(by, text, None if to is None else tuple(to)))
         for circle in self._all_circles() if self.alternates else ():
             if circle.turn == by:
                 self._next_turn(circle, None)
@@ -476,16 +476,7 @@ class Talk:
 
     # ---- lines
 
-    def _add(
-        self,
-        by: str,
-        text: str,
-        to: tuple[str, ...] | None,
-        *,
-        id: int | None = None,
-        fields: Mapping[str, Any] | None = None,
-    ) -> Line:
-        line = self._append(by, text, to, id=id, fields=fields)
+    def _record(self, line: Line) -> Line:
         self._emit(RecordTalk(line.record()))
         return line
 
