@@ -417,7 +417,7 @@ def test_after_ctrl_c_the_participant_is_told_that_the_study_was_stopped(local: 
     here.run()
     again = Walker(here.url, "quick", "P1")
     assert again.until("ended")["reason"] == "stopped"
-    assert "The researchers stopped the server" in again.page()
+    assert "The researchers ended your game." in again.page()
 
 
 def test_a_folder_without_a_study_is_reported(local: Make) -> None:
