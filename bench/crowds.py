@@ -16,8 +16,9 @@ import msgspec
 
 from bench.row import Row, row
 from hippodrome.deployment.aws.concurrency import starts
+from hippodrome.deployment.cost import prices
 from hippodrome.deployment.cost.estimate import DNS_QUERIES
-from hippodrome.deployment.cost.prices import FARGATE_MINIMUM, Prices
+from hippodrome.deployment.cost.prices import FARGATE_MINIMUM
 from testing import template
 from testing.quiet_log import quiet
 from testing.simulation import session_checks
@@ -194,7 +195,7 @@ def through(name: str, world: SimulatedWorld, people: Sequence[Any], wrong: Sequ
 
 def bill(world: SimulatedWorld) -> dict[str, float]:
     """Return the likely US dollars of a run by kind of cost, from counts and list prices; all servers on Spot."""
-    prices, calls, now = Prices(), world.cloud.calls, world.clock.seconds
+    calls, now = world.cloud.calls, world.clock.seconds
     tasks = world.platform.tasks.tasks.values()
     hours = sum(max(FARGATE_MINIMUM, (task.closed or now) - task.born) for task in tasks) / 3600
     writes = calls["s3:PutObject"] + calls["s3:ListObjectsV2"]  # deletions are free
@@ -203,17 +204,15 @@ def bill(world: SimulatedWorld) -> dict[str, float]:
     functions = 0.0
     for function in (world.next_step, *world.functions):
         gb = float(properties[named[function.name]]["MemorySize"]) / 1024
-        functions += (
-            function.billed * gb * prices.lambda_gb_second.usd + function.invocations * prices.lambda_request.usd
-        )
+        functions += function.billed * gb * prices.LAMBDA_GB_SECOND + function.invocations * prices.LAMBDA_REQUEST
     return {
         "servers and their public IPv4 addresses": hours
         * prices.server_hour(world.project.size.cpu, world.project.size.memory, spot=True).likely,
         "Lambda": functions,
-        "HTTP API": world.next_step.invocations * prices.http_request.usd,
-        "S3 requests": calls["s3:GetObject"] * prices.s3_read.usd + writes * prices.s3_write.usd,
-        "SNS and SQS": calls["sns:Publish"] * prices.sns_publish.usd + messages * prices.sqs_request.usd,
-        "Route 53 queries": DNS_QUERIES.likely * len(tasks) * prices.dns_query.usd,
+        "HTTP API": world.next_step.invocations * prices.HTTP_REQUEST,
+        "S3 requests": calls["s3:GetObject"] * prices.S3_READ + writes * prices.S3_WRITE,
+        "SNS and SQS": calls["sns:Publish"] * prices.SNS_PUBLISH + messages * prices.SQS_REQUEST,
+        "Route 53 queries": DNS_QUERIES.likely * len(tasks) * prices.DNS_QUERY,
     }
 
 

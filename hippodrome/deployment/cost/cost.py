@@ -3,42 +3,40 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Sequence
-from datetime import UTC, date, datetime, timedelta
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.text import Text
 
 from hippodrome.console import screen
 from hippodrome.console.formatting import count
 from hippodrome.console.problem import Exit, Problem
+from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Server
 from hippodrome.deployment.aws.account import Account, find_installation, open_account
 from hippodrome.deployment.aws.resource_names import STACK, TAG
-from hippodrome.deployment.core import options, participants
+from hippodrome.deployment.core import explain, options, participants
 from hippodrome.deployment.core.server_records import Records
 from hippodrome.deployment.core.study_selection import one_or_all
-from hippodrome.deployment.cost.billed import Billed, billed_or_why
 from hippodrome.deployment.cost.estimate import (
     CostLine,
-    FixedResources,
     StudyToEstimate,
-    WarmCost,
     assumptions,
     month_lines,
     study_lines,
     total,
-    warm,
 )
-from hippodrome.deployment.cost.prices import REGION, Prices, current
-from hippodrome.deployment.cost.spent import Spent, spent
+from hippodrome.deployment.cost.prices import DATE, EXPLORER_REQUEST, REGION, note, server_hour
+from hippodrome.deployment.cost.spent import Spent, billed, spent
 
 if TYPE_CHECKING:
     from hippodrome.control.config import Config
 
 PEOPLE = 100  # participants, if --participants is left out
+_PRICES = {"region": REGION, "date": str(DATE)}
+_FIGURES = ["low $", "likely $", "high $"]
 
 
 def command(
@@ -55,10 +53,7 @@ def command(
     after: Annotated[bool, typer.Option("--spent", help="What the study has cost, or with --all each.")] = False,
     every: options.All = False,
     ask_aws: Annotated[
-        bool, typer.Option("--billed", help="Also what AWS has billed: asks Cost Explorer, $0.01 a request.")
-    ] = False,
-    now: Annotated[
-        bool, typer.Option("--current", help="Ask AWS for Fargate's prices in this region; needs credentials.")
+        bool, typer.Option("--billed", help="Also what AWS has billed: asks Cost Explorer, for $0.01.")
     ] = False,
     as_json: options.Json = False,
     stack: options.Stack = STACK,
@@ -73,17 +68,14 @@ def command(
     """
     if after:
         project = one_or_all(study, every)
-        return _after(open_account(profile, region), stack, project, ask_aws=ask_aws, now=now, as_json=as_json)
+        return _after(open_account(profile, region), stack, project, ask_aws=ask_aws, as_json=as_json)
     if every or ask_aws:
         raise Problem(
             f"{'--all' if every else '--billed'} is about what has been spent.", "Add --spent.", exit_code=Exit.MISUSE
         )
-    account = open_account(profile, region) if now else None
     config = _read(Path(study or "."))
-    setup = config.project.aws_setup
-    where = region or (account.region if account else os.environ.get("AWS_REGION")) or setup.region or REGION
-    prices = _prices(account) if account else Prices()
-    return _before(_study(config, people, minutes, spot), _warm_before(config, prices), prices, where, as_json)
+    where = region or os.environ.get("AWS_REGION") or config.project.aws_setup.region or REGION
+    return _before(_study(config, people, minutes, spot), _warm_before(config), where, as_json)
 
 
 # Before
@@ -98,15 +90,11 @@ def _read(folder: Path) -> Config:
             f"There is no folder {folder}, and an estimate needs the study's config.yml.",
             f"Name the study's folder. What it has cost: `hippodrome cost {folder} --spent`.",
         )
-
     try:
         return read_project(folder)
     except ConfigErrors as errors:
-        raise Problem(
-            f"The project in {folder} has mistakes.",
-            "Correct them first.",
-            [str(diagnostic) for diagnostic in errors.diagnostics],
-        ) from None
+        mistakes = [str(diagnostic) for diagnostic in errors.diagnostics]
+        raise Problem(f"The project in {folder} has mistakes.", "Correct them first.", mistakes) from None
 
 
 def _study(config: Config, people: int, minutes: float | None, spot: bool) -> StudyToEstimate:
@@ -136,203 +124,160 @@ def _study(config: Config, people: int, minutes: float | None, spot: bool) -> St
     )
 
 
-def _warm_before(config: Config, prices: Prices) -> list[WarmCost]:
-    project = config.project
-    if not project.warm_servers:
-        return []
-    return [warm(project.id, project.warm_servers, project.aws_setup.cpu or 1, project.aws_setup.memory or 2, prices)]
-
-
-def _fixed_resources() -> FixedResources:
-    from hippodrome.deployment.code.template import Template  # noqa: PLC0415 - reads YAML
-
-    try:
-        return FixedResources.of(Template.read().resources({"AlarmEmail": "", "MonthlyBudget": "0"}))
-    except Problem:
-        return FixedResources()
-
-
-def _before(study: StudyToEstimate, waiting: Sequence[WarmCost], prices: Prices, region: str, as_json: bool) -> int:
-    lines, monthly = study_lines(study, prices), month_lines(prices, _fixed_resources())
-    notes = [*assumptions(study), prices.note(region)]
+def _before(study: StudyToEstimate, warm: Sequence[dict[str, Any]], region: str, as_json: bool) -> int:
+    lines, monthly = study_lines(study), month_lines()
+    each = total(lines) * (1 / study.participants)
+    notes = [*assumptions(study), note(region, datetime.now(UTC).date())]
     if as_json:
         screen.result_json(
             {
                 "participants": study.participants,
-                "study": [_line(line) for line in lines],
+                "study": [line._asdict() | {"usd": line.usd.as_json()} for line in lines],
                 "total": total(lines).as_json(),
-                "perParticipant": (total(lines) * (1 / study.participants)).as_json(),
-                "warmServers": [_warm(person) for person in waiting],
-                "month": [_line(line) for line in monthly],
+                "perParticipant": each.as_json(),
+                "warmServers": warm,
+                "month": [line._asdict() | {"usd": line.usd.as_json()} for line in monthly],
                 "monthTotal": total(monthly).as_json(),
                 "assumptions": notes,
-                "prices": {"region": prices.region, "date": prices.date},
+                "prices": _PRICES,
             }
         )
         return Exit.DONE
-    people = count(study.participants, "participant")
-    _table(f"The study, {people}", [*lines, CostLine("Together", "", total(lines))], study.participants)
-    screen.result("")
-    _show_warm(waiting)
+    together = [CostLine("Together", "", total(lines)), CostLine("Each participant", "", each)]
+    _table(f"The study, {count(study.participants, 'participant')}", [*lines, *together])
+    _show_warm(warm)
     _table(
         "A month of the installation, even without participants", [*monthly, CostLine("Together", "", total(monthly))]
     )
-    screen.result("")
-    for note in notes:
-        screen.result(note)
+    for sentence in notes:
+        screen.result(sentence)
     return Exit.DONE
 
 
-def _table(title: str, lines: Sequence[CostLine], people: int = 0) -> None:
+def _table(title: str, lines: Iterable[CostLine]) -> None:
     rows = [(line.what, line.amount, *map(_money, line.usd)) for line in lines]
-    if people > 1:
-        rows.append(("Each participant", "", *map(_money, lines[-1].usd * (1 / people))))
-    right = ["amount", "low $", "likely $", "high $"]
-    screen.table(["", *right], rows, title, right=right)
+    screen.table(["", "amount", *_FIGURES], rows, title, right=["amount", *_FIGURES])
+    screen.result("")
 
 
-def _show_warm(waiting: Sequence[WarmCost]) -> None:
+# Warm servers
+
+
+def _warm_before(config: Config) -> list[dict[str, Any]]:
+    setup = config.project.aws_setup
+    return _warm(config.project.id, config.project.warm_servers, setup.cpu or 1, setup.memory or 2)
+
+
+def _warm(project_id: str, servers: int, cpu: float, memory: float) -> list[dict[str, Any]]:
+    """Compute what a project's warm servers cost in an hour, as JSON data; [] if it has none.
+
+    A server that waits costs as much as one in use.
+    """
+    spot, on_demand = (server_hour(cpu, memory, spot=kind) * servers for kind in (True, False))
+    size = {"servers": servers, "cpu": cpu, "memory": memory}
+    hours = {"spotHour": spot.as_json(), "onDemandHour": on_demand.as_json()}
+    return [{"project": project_id, **size, **hours}] if servers else []
+
+
+def _show_warm(warm: Sequence[dict[str, Any]]) -> None:
     """Print what warm servers cost in an hour and in a day, since it is not known how long their studies stay live."""
-    rows: list[Sequence[object]] = []
-    for person in waiting:
-        size = f"{person.servers} of {person.cpu:g} vCPU, {person.memory:g} GB"
-        kinds = ((person.project_id, f"{size}, on Spot", person.spot), ("", "the same on demand", person.on_demand))
-        rows += [(name, what, _money(hour.likely), _money(hour.likely * 24)) for name, what, hour in kinds]
+    rows = []
+    for of_project in warm:
+        size = f"{of_project['servers']} of {of_project['cpu']:g} vCPU, {of_project['memory']:g} GB"
+        for kind, hour in (("on Spot", of_project["spotHour"]), ("on demand", of_project["onDemandHour"])):
+            usd = hour["likely"]
+            rows.append((of_project["project"], f"{size}, {kind}", _money(usd), _money(usd * 24)))
     if rows:
         title = "Servers that are kept warm, for as long as the study is live, even without participants"
         screen.table(["project", "servers", "an hour $", "a day $"], rows, title, right=["an hour $", "a day $"])
-        screen.result("On Spot at 65 % off. If Spot has no room when a warm server starts, it runs on demand.")
         screen.result("")
 
 
 # After
 
 
-def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, now: bool, as_json: bool) -> int:
-    installation = find_installation(account, stack)
-    documents = account.platform(installation).documents
+def _after(account: Account, stack: str, project: str | None, *, ask_aws: bool, as_json: bool) -> int:
+    documents = account.platform(find_installation(account, stack)).documents
     projects = participants.choose(participants.registered_projects(documents), project)
-    prices = _prices(account) if now else Prices()
-    at = datetime.now(UTC)
-    records = Records(documents)
+    at, reader = datetime.now(UTC), Records(documents)
     with screen.ProgressBars() as progress:
         bar = progress.add_task("Reading the records of servers", total=None)
-        every = records.since(advance=lambda done, of: progress.update(bar, completed=done, total=of))
-    sizes = {project.id: (project.size.cpu, project.size.memory) for project in projects}
-    owned = {project.id: [r for r in every if r.project_id == project.id] for project in projects}
-    by_project = {name: spent(records, prices, at, sizes) for name, records in owned.items() if project or records}
-    waited = {name: spent([r for r in owned[name] if r.is_warm_server], prices, at, sizes) for name in by_project}
-    now_warm = [
-        warm(project.id, project.warm_servers, project.size.cpu, project.size.memory, prices)
-        for project in projects
-        if project.live and project.warm_servers
-    ]
-    mine = [r for r in every if project in (None, r.project_id)]
-    bill, no_bill = _bill(account, stack, mine, at) if ask_aws else (None, "")
+        records = reader.since(advance=lambda done, of: progress.update(bar, completed=done, total=of))
+    owned = {each.id: [record for record in records if record.project_id == each.id] for each in projects}
+    sums = {name: spent(of_project, at) for name, of_project in owned.items() if project or of_project}
+    waiting = {name: spent((record for record in owned[name] if record.is_warm_server), at) for name in sums}
+    warm = [line for each in projects if each.live for line in _warm_now(each)]
+    mine = [record for of_project in owned.values() for record in of_project]
+    bill, why = _bill(account, stack, mine, at) if ask_aws else ({}, "")
     if as_json:
-        screen.result_json(
-            {
-                "projects": {
-                    name: {**_spent(one), "waiting": _spent(waited[name])} for name, one in by_project.items()
-                },
-                "warmServers": [_warm(one) for one in now_warm],
-                "unreadable": records.unreadable,
-                "billed": _billed(bill) if bill else None,
-                "problems": {"bill": no_bill} if no_bill else {},
-                "prices": {"region": prices.region, "date": prices.date},
-            }
-        )
+        by_project = {name: {**_spent(amounts), "waiting": _spent(waiting[name])} for name, amounts in sums.items()}
+        data = {"projects": by_project, "warmServers": warm, "unreadable": reader.unreadable, "prices": _PRICES}
+        problems = {"problems": {"bill": why} if why else {}}
+        screen.result_json({**data, "billed": bill if ask_aws and not why else None, **problems})
         return Exit.DONE
-    rows = []
-    for name, one in by_project.items():
-        rows.append(_row(name, one))
-        if waited[name].attempts:
-            rows.append(_row("  of it, waiting (warm servers)", waited[name]))
-    if rows:
-        right = ["servers", "hours", "low $", "likely $", "high $"]
-        screen.table(["project", *right], rows, "Servers, from their own records", right=right)
-    else:
-        screen.result("No server has run yet.")
-    for note in _notes(by_project.values(), records.unreadable):
-        screen.result(note)
-    if rows:
-        screen.result(prices.note(account.region))
-        screen.result(
-            "Not in it: functions, requests and data, which cost little; see `hippodrome cost` without --spent."
-        )
-    if now_warm:
-        screen.result("")
-        _show_warm(now_warm)
-    if bill:
-        _show_bill(bill, project)
-    elif no_bill:
-        screen.out.print(Text(f"\n! No bill: {no_bill}", style="yellow"))
+    _show_sums(sums, waiting)
+    if reader.unreadable:
+        screen.result(f"{count(reader.unreadable, 'record')} cannot be read, and not counted.")
+    if sums:
+        screen.result(note(account.region, at.date()))
+        screen.result("Functions, requests and data cost little and are not in it: see `hippodrome cost`.")
+    screen.result("")
+    _show_warm(warm)
+    if why:
+        screen.result(f"! No bill: {why}")
+        screen.result("Cost Explorer has to be switched on in the Billing console; it takes a day to fill.")
+    elif ask_aws:
+        _show_bill(bill)
     return Exit.DONE
+
+
+def _warm_now(project: Project) -> list[dict[str, Any]]:
+    return _warm(project.id, project.warm_servers, project.size.cpu, project.size.memory)
+
+
+def _show_sums(sums: dict[str, Spent], waiting: dict[str, Spent]) -> None:
+    rows = []
+    for name, amounts in sums.items():
+        rows.append(_row(name, amounts))
+        if waiting[name].attempts:
+            rows.append(_row("  of it, waiting (warm servers)", waiting[name]))
+    if not rows:
+        screen.result("No server has run yet.")
+        return
+    right = ["servers", "hours", *_FIGURES]
+    screen.table(["project", *right], rows, "Servers, from their own records", right=right)
+    if never := sum(amounts.never_ran for amounts in sums.values()):
+        screen.result(f"{never:,} more were asked for and never ran: not counted.")
 
 
 def _row(name: str, amounts: Spent) -> tuple[object, ...]:
     return (name, amounts.attempts, f"{amounts.hours:,.1f}", *map(_money, amounts.usd))
 
 
-def _notes(found: Collection[Spent], unreadable: int) -> list[str]:
-    never, guessed = sum(amounts.never_ran for amounts in found), sum(one.guessed for one in found)
-    notes = []
-    if never:
-        notes.append(f"{never:,} more were asked for and never ran: not counted.")
-    if guessed:
-        notes.append(
-            f"{guessed:,} records do not say what the server ran on: computed with the project's present size."
-        )
-    if unreadable:
-        notes.append(f"{unreadable:,} records cannot be read and are not counted.")
-    return notes
-
-
-def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime) -> tuple[Billed | None, str]:
+def _bill(account: Account, stack: str, records: Sequence[Server], now: datetime) -> tuple[dict[str, float], str]:
     """Ask for the bill since the day of the first server, or without servers since the first day of this month.
 
-    If there is no bill, return None and the reason.
+    If there is no bill, return the reason, too.
     """
     first = min((r.earlier[0].requested if r.earlier else r.requested for r in records), default=now.replace(day=1))
-    # Cost Explorer remembers about a year.
-    start: date = max(first.date(), (now - timedelta(days=364)).date())
-    return billed_or_why(account, stack, start, (now + timedelta(days=1)).date())
-
-
-def _show_bill(bill: Billed, project: str | None) -> None:
-    rows = [(service, _money(amount)) for service, amount in sorted(bill.tagged.items(), key=lambda row: -row[1])]
-    screen.result("")
-    title = f"Billed by AWS, {bill.start} to {bill.end}, with the stack's tag"
-    if rows:
-        screen.table(["service", "$"], [*rows, ("Together", _money(sum(bill.tagged.values())))], title, right=["$"])
-    else:
-        screen.result(f"{title}: nothing. The tag {TAG} has to be a cost allocation tag (Billing console).")
-    if bill.fargate is not None:
-        screen.result(f"All Fargate tasks of the account in this region: ${_money(bill.fargate)}.")
-    if project:
-        screen.result("AWS's bill is not divided by projects.")
-    screen.result(f"AWS is a day behind. Asking has cost ${bill.asking:.2f}.")
-
-
-def _prices(account: Account) -> Prices:
-    today = datetime.now(UTC).date().isoformat()
+    start = max(first, now - timedelta(days=364)).date()  # Cost Explorer remembers about a year
     try:
-        return current(account.client("pricing", "us-east-1"), account.region, today)
-    except LookupError as error:
-        raise Problem(f"{error}.", "Leave out --current to use the table of this version.") from None
+        return billed(account, stack, start, (now + timedelta(days=1)).date()), ""
+    except Exception as error:
+        problem = explain.problem_from(error)
+        if problem is None:
+            raise
+        return {}, f"{problem} {problem.advice}".strip()
 
 
-def _line(line: CostLine) -> dict[str, Any]:
-    return {"what": line.what, "amount": line.amount, "usd": line.usd.as_json()}
-
-
-def _warm(warm_cost: WarmCost) -> dict[str, Any]:
-    return {
-        "project": warm_cost.project_id,
-        "servers": warm_cost.servers,
-        "spotHour": warm_cost.spot.as_json(),
-        "onDemandHour": warm_cost.on_demand.as_json(),
-    }
+def _show_bill(bill: dict[str, float]) -> None:
+    rows = [(service, _money(usd)) for service, usd in sorted(bill.items(), key=lambda row: -row[1])]
+    if rows:
+        title = "Billed by AWS for all that has the stack's tag, a day behind, not divided by projects"
+        screen.table(["service", "$"], [*rows, ("Together", _money(sum(bill.values())))], title, right=["$"])
+    else:
+        screen.result(f"AWS has billed nothing with the tag {TAG}: make it a cost allocation tag (Billing console).")
+    screen.result(f"This request has cost ${EXPLORER_REQUEST}.")
 
 
 def _spent(amounts: Spent) -> dict[str, Any]:
@@ -341,17 +286,6 @@ def _spent(amounts: Spent) -> dict[str, Any]:
         "hours": round(amounts.hours, 3),
         "servers": amounts.attempts,
         "neverRan": amounts.never_ran,
-        "sizeGuessed": amounts.guessed,
-    }
-
-
-def _billed(bill: Billed) -> dict[str, Any]:
-    return {
-        "from": bill.start,
-        "to": bill.end,
-        "tagged": bill.tagged,
-        "fargateOfTheAccount": bill.fargate,
-        "askingCost": bill.asking,
     }
 
 

@@ -8,12 +8,13 @@ scaled by the number of steps. A figure that is not measured is assumed, low, li
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from hippodrome.console.formatting import count
-from hippodrome.deployment.cost.prices import HOURS, Prices, Range, Usd
+from hippodrome.deployment.cost import prices
+from hippodrome.deployment.cost.prices import HOURS, Range, server_hour
 
 BENCH_STEPS = 5  # steps of the example study
 S3_READS = Range(4, 4, 13)  # GETs of a participant; high: of one who comes alone, with stale caches
@@ -41,14 +42,18 @@ IMAGE_GB = Range(0.3, 0.8, 2.5)  # of a project
 UNUSED = 10  # minutes until a server without its participant ends: IDLE_SECONDS in hippodrome/trial/settings.py
 UNUSED_AHEAD = 35  # minutes until a server started ahead of a session is stopped: MAX_OPEN, and the next sweep
 DNS_QUERIES = Range(4, 10, 40)
+# What infra/template.yml makes, and what of it is free unless the account uses that already.
+QUEUES, ALARMS, METRICS, DASHBOARDS = 3, 25, 6, 1
+SWEEPS = 12 * HOURS  # every five minutes
+SWEEP_WRITES, SWEEP_READS = 3, 4  # listings and reads of a sweep of an installation without servers
 
 
 class CostLine(NamedTuple):
-    """One line of the estimate: what is billed, the likely amount of it, and what it costs."""
+    """One line of the estimate: what is billed, the likely amount of it, and what it costs in US dollars."""
 
     what: str
     amount: str
-    usd: Usd
+    usd: Range
 
 
 @dataclass(frozen=True)
@@ -77,44 +82,84 @@ class StudyToEstimate:
     @property
     def has_sessions(self) -> bool:
         """Whether several participants share a server."""
-        return self.players > 1
+        return self.games and self.players > 1
 
     @property
     def lobby_polls(self) -> Range:
         """The number of requests that the pages of all participants make while they wait in the lobby."""
-        if not self.games or not self.has_sessions:
+        if not self.has_sessions:
             return Range()
         most = self.patience / 2
         return Range(min(LOBBY_POLLS.low, most), min(LOBBY_POLLS.likely, most), most) * self.participants
-
-    @property
-    def clients(self) -> int:
-        """The number of participants who wait for a server and play; 0 without a game."""
-        return self.participants if self.games else 0
 
     @property
     def server_minutes(self) -> Range:
         """The minutes of one server, from its start message to its end."""
         if not self.games:
             return Range()
+        longest = float(self.max_runtime)
         if self.minutes is not None:
-            return Range(self.minutes, self.minutes, max(self.minutes, float(self.max_runtime)))
-        return Range(self.max_runtime / 4, self.max_runtime / 2, float(self.max_runtime))
+            return Range(self.minutes, self.minutes, max(self.minutes, longest))
+        return Range(longest / 4, longest / 2, longest)
 
 
-def study_lines(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
+def study_lines(study: StudyToEstimate) -> list[CostLine]:
     """Estimate what participants cost, a line for each thing."""
-    return [*_servers(study, prices), *_functions(study, prices), *_small_things(study, prices), *_data(study, prices)]
+    people, servers = study.participants, study.servers
+    polls = POLLS * (people if study.games else 0)
+    pages = Range.exactly(people * (2 * study.steps - 1)) + polls + study.lobby_polls  # a GET and a POST for each step
+    signed, workers = SIGNED * servers, WORKERS * servers
+    http = pages + signed
+    gb_seconds = (pages * NEXT_STEP_GB + signed * WORKER_GB) * NEXT_STEP_SECONDS + workers * WORKER_SECONDS * WORKER_GB
+    scale = people * study.steps / BENCH_STEPS
+    # Each poll of the waiting page is one more read, each presigned request two more. A poll in the lobby reads the
+    # membership and the decisions, lists the entries, and writes the participant's own entry.
+    reads = S3_READS * scale + Range.exactly(TRIAL_READS * servers) + signed * 2 + polls + study.lobby_polls * 2
+    writes = Range.exactly(S3_WRITES * scale + TRIAL_WRITES * servers) + study.lobby_polls * 2
+    messages = workers * 3  # sent, received, deleted
+    frames = study.server_minutes * PLAYED * (60 * study.frame_rate)
+    megabytes = people / 1e6  # turns kB of each participant into GB of all
+    sent = (frames * FRAME_KB + PAGE_LOADS * (study.steps * PAGE_KB)) * megabytes
+    recorded = frames * (PICTURE_KB if study.observations else RECORDED_KB)
+    kept, logged = (recorded + Range.exactly(ANSWERS_KB)) * megabytes, LOG_KB * megabytes
+    return [
+        *_server_lines(study),
+        CostLine(
+            "Functions (Lambda)",
+            f"{gb_seconds.likely:,.0f} GB-s",
+            gb_seconds * prices.LAMBDA_GB_SECOND + (http + workers) * prices.LAMBDA_REQUEST,
+        ),
+        CostLine("HTTP API", f"{http.likely:,.0f} requests", http * prices.HTTP_REQUEST),
+        CostLine(
+            "S3 requests",
+            f"{(reads + writes).likely:,.0f} requests",
+            reads * prices.S3_READ + writes * prices.S3_WRITE,
+        ),
+        CostLine(
+            "Messages and DNS (SNS, SQS, Route 53)",
+            f"{messages.likely:,.0f} requests",
+            messages * prices.SQS_REQUEST
+            + Range.exactly(PUBLISHES * servers * prices.SNS_PUBLISH)
+            + DNS_QUERIES * servers * prices.DNS_QUERY,
+        ),
+        CostLine("Data to participants", f"{sent.likely:,.2f} GB", sent * prices.OUT_GB),
+        CostLine(
+            f"Data kept in S3, {MONTHS_KEPT.likely} months",
+            f"{kept.likely:,.2f} GB",
+            kept * MONTHS_KEPT * prices.S3_GB_MONTH,
+        ),
+        CostLine("Logs", f"{logged.likely:,.3f} GB", logged * (prices.LOG_GB + 3 * prices.LOG_GB_MONTH)),
+    ]
 
 
-def _servers(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
+def _server_lines(study: StudyToEstimate) -> list[CostLine]:
     if not study.games:
         return []
     hours = study.server_minutes * study.servers * (1 / 60)
-    hour, on_demand = (prices.server_hour(study.cpu, study.memory, spot=spot) for spot in (study.spot, False))
-    address = prices.ipv4_hour.usd
+    hour, on_demand = (server_hour(study.cpu, study.memory, spot=spot) for spot in (study.spot, False))
+    address = Range.exactly(prices.IPV4_HOUR)
     # If Spot has no room, a server runs on demand; in the worst case all servers do.
-    machine = Usd(hour.low, hour.likely, on_demand.high) + Usd.exactly(-address)
+    machine = Range(hour.low, hour.likely, on_demand.high) + address * -1
     size = f"{study.cpu:g} vCPU, {study.memory:g} GB"
     kind = "Fargate Spot" if study.spot else "Fargate"
     return [
@@ -123,184 +168,67 @@ def _servers(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
     ]
 
 
-class WarmCost(NamedTuple):
-    """The cost of all warm servers of a project together in an hour while they wait, on Spot and on demand."""
-
-    project_id: str
-    servers: int
-    cpu: float  # vCPU of each
-    memory: float  # GB
-    spot: Usd
-    on_demand: Usd
-
-
-def warm(project_id: str, servers: int, cpu: float, memory: float, prices: Prices) -> WarmCost:
-    """Compute what a project's warm servers cost in an hour.
-
-    A server that waits costs as much as one on which a participant plays.
-    """
-    spot, on_demand = (prices.server_hour(cpu, memory, spot=kind) * servers for kind in (True, False))
-    return WarmCost(project_id, servers, cpu, memory, spot, on_demand)
-
-
-def _functions(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
-    pages, signed, workers = _page_requests(study), SIGNED * study.servers, WORKERS * study.servers
-    http = pages + signed
-    gb_seconds = (pages * NEXT_STEP_GB + signed * WORKER_GB) * NEXT_STEP_SECONDS + workers * WORKER_SECONDS * WORKER_GB
-    return [
-        CostLine("Lambda requests", f"{(http + workers).likely:,.0f}", (http + workers) * prices.lambda_request.usd),
-        CostLine("Lambda time", f"{gb_seconds.likely:,.0f} GB-s", gb_seconds * prices.lambda_gb_second.usd),
-        CostLine("HTTP API", f"{http.likely:,.0f} requests", http * prices.http_request.usd),
-    ]
-
-
-def _small_things(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
-    scale, servers = study.participants * study.steps / BENCH_STEPS, study.servers
-    # Each poll of the waiting page is one more read, each presigned request two more.
-    reads = S3_READS * scale + (Range.exactly(TRIAL_READS) + SIGNED * 2) * servers + POLLS * study.clients
-    writes = Range.exactly(S3_WRITES * scale + TRIAL_WRITES * servers)
-    # A poll in the lobby reads the membership and the decisions, lists the entries (which costs as much as a write),
-    # and writes the participant's own entry.
-    reads, writes = reads + study.lobby_polls * 2, writes + study.lobby_polls * 2
-    messages = WORKERS * (servers * 3)  # sent, received, deleted
-    queries = DNS_QUERIES * servers
-    return [
-        CostLine(
-            "S3 requests",
-            f"{(reads + writes).likely:,.0f}",
-            reads * prices.s3_read.usd + writes * prices.s3_write.usd,
-        ),
-        CostLine(
-            "SNS", f"{servers * PUBLISHES:,} publishes", Usd.exactly(servers * PUBLISHES * prices.sns_publish.usd)
-        ),
-        CostLine("SQS", f"{messages.likely:,.0f} requests", messages * prices.sqs_request.usd),
-        CostLine(
-            "EventBridge Scheduler", f"{servers:,} timers at most", Usd(0, 0, servers * prices.scheduler_invocation.usd)
-        ),
-        CostLine("Route 53 (changes are free)", f"{queries.likely:,.0f} queries", queries * prices.dns_query.usd),
-    ]
-
-
-def _data(study: StudyToEstimate, prices: Prices) -> list[CostLine]:
-    per_gb = study.participants / 1e6
-    frames = study.server_minutes * PLAYED * (60 * study.frame_rate)
-    out = (frames * FRAME_KB + PAGE_LOADS * (study.steps * PAGE_KB)) * per_gb
-    kilobytes = PICTURE_KB if study.observations else RECORDED_KB
-    stored = (frames * kilobytes + Range.exactly(ANSWERS_KB)) * per_gb
-    logged = LOG_KB * per_gb
-    label = f"Data kept in S3, {MONTHS_KEPT.likely} months"
-    return [
-        CostLine("Data to participants", f"{out.likely:,.2f} GB", out * prices.out_gb.usd),
-        CostLine(label, f"{stored.likely:,.2f} GB", stored * MONTHS_KEPT * prices.s3_gb_month.usd),
-        CostLine("Logs", f"{logged.likely:,.3f} GB", logged * (prices.log_gb.usd + 3 * prices.log_gb_month.usd)),
-    ]
-
-
-def _page_requests(study: StudyToEstimate) -> Range:
-    """Return the requests to `next_step`: a GET and a POST for each step, except a POST for the last one; and polls."""
-    return Range.exactly(study.participants * (2 * study.steps - 1)) + POLLS * study.clients + study.lobby_polls
-
-
-SWEEP_REQUESTS = (3, 4)
-"""The listings and reads of a sweep of an installation without servers."""
-
-
-@dataclass(frozen=True)
-class FixedResources:
-    """The resources of an installation that cost something without participants, as counted in `infra/template.yml`."""
-
-    queues: int = 3  # queues with a function behind them
-    alarms: int = 25
-    dashboards: int = 1
-    metrics: int = 6
-    sweeps: int = 12 * HOURS  # every five minutes
-
-    @classmethod
-    def of(cls, resources: Mapping[str, Mapping[str, Any]]) -> FixedResources:
-        """Count the resources of a template."""
-        kinds = [str(resource.get("Type")) for resource in resources.values()]
-        return cls(
-            queues=kinds.count("AWS::Lambda::EventSourceMapping"),
-            alarms=kinds.count("AWS::CloudWatch::Alarm"),
-            dashboards=kinds.count("AWS::CloudWatch::Dashboard"),
-        )
-
-
-def month_lines(prices: Prices, fixed: FixedResources) -> list[CostLine]:
+def month_lines() -> list[CostLine]:
     """Estimate what a month costs without participants. The high figures are without free tiers."""
     # Five pollers of Lambda ask each queue; a request to an empty queue takes 20 seconds. Lambda reduces five to two
     # only for mappings without a maximum concurrency (Developer Guide, "Configuring scaling behavior for SQS").
-    polls = fixed.queues * 5 * HOURS * 180.0
-    sweeps = SWEEP_SECONDS * (fixed.sweeps * WORKER_GB)
-    gb_second = prices.lambda_gb_second.usd
-    free = {"alarm": 10, "metric": 10, "dashboard": 3, "sqs": 1e6}
-    least = max(0.0, polls - free["sqs"])
+    asked = QUEUES * 5 * HOURS * 180
+    sweeps = SWEEP_SECONDS * (SWEEPS * WORKER_GB)
+    requests = SWEEPS * (SWEEP_WRITES * prices.S3_WRITE + SWEEP_READS * prices.S3_READ)
     return [
-        CostLine("Hosted zone, with a domain", "1", Usd(0, prices.zone_month.usd, prices.zone_month.usd)),
-        _fixed("Alarms", fixed.alarms, prices.alarm_month.usd, free["alarm"]),
-        _fixed("Metrics", fixed.metrics, prices.metric_month.usd, free["metric"]),
-        _fixed("Dashboard", fixed.dashboards, prices.dashboard_month.usd, free["dashboard"]),
+        CostLine("Hosted zone, with a domain", "1", Range(0, prices.ZONE_MONTH, prices.ZONE_MONTH)),
+        _fixed("Alarms", ALARMS, 10, prices.ALARM_MONTH),
+        _fixed("Metrics", METRICS, 10, prices.METRIC_MONTH),
+        _fixed("Dashboard", DASHBOARDS, 3, prices.DASHBOARD_MONTH),
+        _fixed("Requests to the queues (SQS)", asked, 1_000_000, prices.SQS_REQUEST),
         CostLine(
-            "Asking the queues (SQS)",
-            f"{polls:,.0f} requests",
-            Usd(least, least, polls) * prices.sqs_request.usd,
+            "Sweeps (Lambda, S3)",
+            f"{SWEEPS:,}",
+            Range(0, sweeps.likely, sweeps.high) * prices.LAMBDA_GB_SECOND + Range.exactly(requests),
         ),
-        CostLine("Sweeps (Lambda)", f"{sweeps.likely:,.0f} GB-s", Usd(0, sweeps.likely, sweeps.high) * gb_second),
-        CostLine(
-            "Sweeps (S3)",
-            f"{fixed.sweeps * sum(SWEEP_REQUESTS):,} requests",
-            Usd.exactly(
-                fixed.sweeps * (SWEEP_REQUESTS[0] * prices.s3_write.usd + SWEEP_REQUESTS[1] * prices.s3_read.usd)
-            ),
-        ),
-        CostLine("Images (ECR)", f"{IMAGE_GB.likely:,.1f} GB", IMAGE_GB * prices.ecr_gb_month.usd),
-        CostLine("NAT gateway, load balancer, database", "none", Usd()),
+        CostLine("Images (ECR)", f"{IMAGE_GB.likely:,.1f} GB", IMAGE_GB * prices.ECR_GB_MONTH),
+        CostLine("NAT gateway, load balancer, database", "none", Range()),
     ]
 
 
-def _fixed(what: str, number: int, price: float, free: float) -> CostLine:
-    """Return a line for so many resources, of which `free` are free, unless the account uses these already."""
-    least = max(0.0, number - free) * price
-    return CostLine(what, f"{number}", Usd(least, least, number * price))
+def _fixed(what: str, number: int, free: int, price: float) -> CostLine:
+    """Return a line for so many, of which `free` are free, unless the account uses these already."""
+    least = max(0, number - free) * price
+    return CostLine(what, f"{number:,}", Range(least, least, number * price))
 
 
 def assumptions(study: StudyToEstimate) -> list[str]:
     """Write the assumptions of the estimate, in sentences."""
+    sentences = [f"{count(study.participants, 'participant')}, and each does all {study.steps} steps."]
+    if not study.games:
+        return sentences
     low, likely, high = study.server_minutes
     minutes = f"{likely:g} minutes likely" if low == likely else f"{low:g} to {high:g} minutes, {likely:g} likely"
-    sentences = [f"{count(study.participants, 'participant')}, and each does all {study.steps} steps."]
-    if study.games:
-        whom = f" {study.players}" if study.has_sessions else ""
+    whom = f" {study.players}" if study.has_sessions else ""
+    sentences.append(f"A server for each{whom}: {minutes}, {high:g} at most (maxRuntime).")
+    if study.minutes is None:
+        sentences[-1] += " Give the mean time with --minutes: it decides most of the cost."
+    hour, on_demand = (server_hour(study.cpu, study.memory, spot=spot).likely for spot in (True, False))
+    sentences.append(f"An hour of a server, with its address: ${hour:.3f} on Spot, ${on_demand:.3f} on demand.")
+    if study.has_sessions:
+        wait = min(2 * LOBBY_POLLS.likely, study.patience)
         sentences.append(
-            f"A server for each{whom}: {minutes}, {high:g} at most (maxRuntime). "
-            + ("" if study.minutes is not None else "Give the mean time with --minutes: it decides most of the cost.")
+            f"Each waits {wait:g} seconds in the lobby, {study.patience:g} at most. A server that is started ahead for "
+            f"{study.players} people who do not come runs for up to {UNUSED_AHEAD} minutes, and is not counted."
         )
-        if study.has_sessions:
-            likely_wait = min(2 * LOBBY_POLLS.likely, study.patience)
-            sentences.append(
-                f"Each waits {likely_wait:g} seconds in the lobby, {study.patience:g} at most. Servers that are "
-                f"started ahead and not used are not counted: one for {study.players} people who begin and do not "
-                f"come to the game, which runs for {UNUSED_AHEAD:g} minutes at most."
-            )
-        if study.at_link and study.has_sessions:
-            sentences.append(
-                f"Every {study.players} opened links start a server. Those of {study.players} people who look and "
-                f"leave are not counted here: each runs for up to {UNUSED_AHEAD:g} minutes."
-            )
-        elif study.at_link:
-            sentences.append(
-                "Every opened link starts a server. Those of people who look and leave are not counted here: "
-                f"each runs for about {UNUSED:g} minutes."
-            )
-        sentences.append(
-            f"Pictures of {FRAME_KB.likely:g} kB (a flat game), {study.frame_rate:g} a second; high: {FRAME_KB.high:g} "
-            "kB, the JPEG of a texture of 600 x 400 pixels that moves in each. Larger ones, or lossless, take more."
-        )
-    if study.games and study.spot:
+    if study.at_link:
+        link = f"Every {study.players} opened links start" if study.has_sessions else "Every opened link starts"
+        unused = UNUSED_AHEAD if study.has_sessions else UNUSED
+        sentences.append(f"{link} a server. Those of people who look and leave run for {unused} minutes: not counted.")
+    sentences.append(
+        f"Pictures of {FRAME_KB.likely:g} kB (a flat game), {study.frame_rate:g} a second; high: {FRAME_KB.high:g} "
+        "kB, the JPEG of a texture of 600 x 400 pixels that moves in each. Larger ones, or lossless, take more."
+    )
+    if study.spot:
         sentences.append("Likely all on Spot at 65 % off; low 70 % off; high all on demand because Spot has no room.")
-    return [line.strip() for line in sentences]
+    return sentences
 
 
-def total(lines: list[CostLine]) -> Usd:
+def total(lines: Iterable[CostLine]) -> Range:
     """Return the sum of the lines."""
-    return sum((line.usd for line in lines), Usd())
+    return sum((line.usd for line in lines), Range())

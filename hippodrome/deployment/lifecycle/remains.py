@@ -11,7 +11,7 @@ from hippodrome.console import screen
 from hippodrome.console.formatting import count, duration, size
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.deployment.aws.account import Account
-from hippodrome.deployment.cost.prices import Prices
+from hippodrome.deployment.cost.prices import S3_GB_MONTH
 from hippodrome.deployment.lifecycle.removal import FoundInstallation, Removal
 from hippodrome.deployment.stack import acm_records, inventory, retained_bucket
 from hippodrome.deployment.stack.acm_records import Validation
@@ -128,7 +128,7 @@ class Remains:
             names = [thing.name for thing in self.left if thing.kind == kind]
             yield kind, str(len(names)), inventory.cost_of(kind), ", ".join(names[:3])
         for bucket, stored in self.stored.items():
-            month = f"${stored / 1e9 * Prices().s3_gb_month.usd:,.2f} ({size(stored)})"
+            month = f"${stored / 1e9 * S3_GB_MONTH:,.2f} ({size(stored)})"
             yield "participants' data", "kept", month, bucket
         for one, _, _ in self.records:
             yield "DNS record", "kept", "nothing", one.name

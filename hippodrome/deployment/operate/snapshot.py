@@ -27,7 +27,6 @@ from hippodrome.deployment.aws.account import Account, Installation
 from hippodrome.deployment.core import explain, participants
 from hippodrome.deployment.core.participants import ParticipantCounts
 from hippodrome.deployment.core.server_records import SLACK, Records, attempts_of
-from hippodrome.deployment.cost.prices import Prices
 from hippodrome.deployment.cost.spent import Spent, spent
 from hippodrome.deployment.stack.stack import Stack
 
@@ -161,8 +160,7 @@ class InstallationMonitor:
             self._try(look, "projects", partial(self._projects, progress=progress))
             for server in running:
                 server.result()
-        sizes = {project.id: (project.size.cpu, project.size.memory) for project, _ in look.projects}
-        look.spent = spent(look.recent, Prices(), look.at, sizes, since=midnight(look.at))
+        look.spent = spent(look.recent, look.at, since=midnight(look.at))
         return look
 
     def _try(self, look: Snapshot, part: str, read: Callable[[Snapshot], None]) -> None:

@@ -6,7 +6,6 @@ import contextlib
 import time
 from collections import Counter
 from collections.abc import Mapping
-from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
 
 import typer
@@ -21,11 +20,10 @@ from hippodrome.console.problem import Exit, Problem
 from hippodrome.console.program import as_typed
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Server
-from hippodrome.deployment.aws.account import Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.account import Installation, find_installation, open_account
 from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import options, participants
 from hippodrome.deployment.core.study_selection import one_or_all
-from hippodrome.deployment.cost.billed import Billed, billed_or_why
 from hippodrome.deployment.operate.snapshot import InstallationMonitor, Snapshot
 from hippodrome.deployment.stack import states
 
@@ -38,9 +36,6 @@ def command(
     *,
     every: options.All = False,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Look again every few seconds, until Ctrl-C.")] = False,
-    ask_aws: Annotated[
-        bool, typer.Option("--billed", help="Also this month's bill so far: asks Cost Explorer, $0.01 a request.")
-    ] = False,
     as_json: options.Json = False,
     stack: options.Stack = STACK,
     region: options.Region = None,
@@ -64,14 +59,10 @@ def command(
         return Exit.DONE
     with screen.err.status("Looking …") as status:
         look = watcher.look(status.update)
-    bill = _bill(account, stack, look) if ask_aws else None
     if as_json:
-        screen.result_json(as_data(look, installation, bill))
+        screen.result_json(as_data(look, installation))
     else:
         screen.out.print(picture(look, installation))
-        if bill:
-            amount = sum(bill.tagged.values())
-            screen.result(f"Billed this month with the stack's tag: ${amount:,.2f}; asking cost ${bill.asking:.2f}.")
     return Exit.DONE
 
 
@@ -98,19 +89,10 @@ def _watch(watcher: InstallationMonitor, installation: Installation) -> None:
         return
 
 
-def _bill(account: Account, stack: str, look: Snapshot) -> Billed | None:
-    """Ask for this month's bill. If there is none, return None, and add the reason to `look.problems`."""
-    today = datetime.now(UTC).date()
-    bill, why = billed_or_why(account, stack, today.replace(day=1), today + timedelta(days=1))
-    if why:
-        look.problems["bill"] = why
-    return bill
-
-
 # For scripts
 
 
-def as_data(look: Snapshot, installation: Installation, bill: Billed | None = None) -> dict[str, Any]:
+def as_data(look: Snapshot, installation: Installation) -> dict[str, Any]:
     """Return the snapshot as JSON data."""
     certificate = look.certificate
     return {
@@ -155,7 +137,6 @@ def as_data(look: Snapshot, installation: Installation, bill: Billed | None = No
             ],
         },
         "spentToday": look.spent.usd.as_json(),
-        "billedThisMonth": {"tagged": bill.tagged, "askingCost": bill.asking} if bill else None,
         "queues": [
             {"name": q.name, "waiting": q.waiting, "inFlight": q.in_flight, "delayed": q.delayed, "deadLetters": q.dead}
             for q in look.queues

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from typing import NamedTuple
 
-from hippodrome.deployment.cost.prices import Prices
+from hippodrome.deployment.cost import prices
 
 
 class Listing(NamedTuple):
@@ -23,13 +23,12 @@ class Listing(NamedTuple):
         return f"aws {self.service} {self.remove} {shlex.quote(name)} --region {region}"
 
 
-_PRICES = Prices()
 _COSTS = {
-    "alarm": f"${_PRICES.alarm_month.usd:.2f}",
-    "dashboard": f"${_PRICES.dashboard_month.usd:.2f}",
-    "image repository": f"${_PRICES.ecr_gb_month.usd:.2f} a GB",
-    "log group": f"${_PRICES.log_gb_month.usd:.2f} a GB",
-    "S3 bucket": f"${_PRICES.s3_gb_month.usd:.2f} a GB",
+    "alarm": f"${prices.ALARM_MONTH:.2f}",
+    "dashboard": f"${prices.DASHBOARD_MONTH:.2f}",
+    "image repository": f"${prices.ECR_GB_MONTH:.2f} a GB",
+    "log group": f"${prices.LOG_GB_MONTH:.2f} a GB",
+    "S3 bucket": f"${prices.S3_GB_MONTH:.2f} a GB",
 }
 
 # type | kind | service

@@ -27,8 +27,7 @@ from hippodrome.deployment.aws.account import Account, Installation, find_instal
 from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import options, project_folder, register_function, secret_parameters
 from hippodrome.deployment.core.participants import registered_projects
-from hippodrome.deployment.cost.estimate import warm
-from hippodrome.deployment.cost.prices import REGION, Prices
+from hippodrome.deployment.cost.prices import REGION, server_hour
 from hippodrome.deployment.study import definition, image, pages
 
 QR_FILES = {".svg", ".png", ".pdf"}
@@ -327,8 +326,8 @@ def _tell_warm(registration: Mapping[str, Any]) -> None:
     number, setup = registration["warmServers"], registration["awsSetup"]
     if not number or not registration["live"]:
         return
-    hour = warm(registration["id"], number, setup["cpu"], setup["memory"], Prices())
-    day, most = hour.spot.likely * 24, hour.on_demand.likely * 24
+    hours = (server_hour(setup["cpu"], setup["memory"], spot=spot).likely for spot in (True, False))
+    day, most = (hour * number * 24 for hour in hours)
     screen.warning(
         f"{formatting.count(number, 'server')} will be kept warm while the study is open: about ${day:,.2f} a day on "
         f"Spot, ${most:,.2f} on demand (list prices of {REGION}). `register --no-live` ends it."

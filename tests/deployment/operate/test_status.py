@@ -274,18 +274,6 @@ def test_status_shows_the_rest_if_a_part_is_refused(world: Installed, capsys: An
     assert "These credentials may not list stack resources" in found["problems"]["queues"]
 
 
-def test_without_cost_explorer_only_the_bill_is_missing(world: Installed, capsys: Any) -> None:
-    world.participant("alice")
-    for _ in range(2):
-        world.fail("ce:GetCostAndUsage", "AccessDeniedException", status=403)
-    found = look(world, capsys, "--all", "--billed")
-    assert found["projects"][0]["participants"] == 1
-    assert (found["billedThisMonth"], list(found["problems"])) == (None, ["bill"])
-    text = " ".join(world.run(capsys, "status", "--all", "--billed").out.split())
-    assert "! No bill: These credentials may not get cost and usage." in text
-    assert "Alarms: none fires." in text
-
-
 def test_a_broken_list_of_projects_is_reported_in_a_sentence(world: Installed, capsys: Any) -> None:
     world.put("project_master_list.json", b'{"projects": {"id": 7}}')
     assert "The list of projects cannot be read" in look(world, capsys)["problems"]["projects"]

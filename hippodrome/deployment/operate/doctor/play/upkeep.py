@@ -14,7 +14,7 @@ from hippodrome.control.model.server import Reason, Server, ServerState
 from hippodrome.control.ports import DnsRecord, Topic
 from hippodrome.deployment.aws import resource_names
 from hippodrome.deployment.core.finding import Mark
-from hippodrome.deployment.cost.prices import Prices, Usd
+from hippodrome.deployment.cost.prices import REGION, Range, server_hour
 from hippodrome.deployment.cost.spent import spent
 from hippodrome.deployment.operate import snapshot
 from hippodrome.deployment.operate.doctor.check_context import CheckFailed
@@ -267,17 +267,17 @@ def _add_seconds(seconds: list[float], begin: datetime | None, end: datetime | N
         seconds.append(max((end - begin).total_seconds(), 0.0))
 
 
-def estimate(project: Project, bots: int) -> Usd:
+def estimate(project: Project, bots: int) -> Range:
     """Estimate what a rehearsal costs: servers run for 2 to 20 minutes each. All else costs less than a cent."""
     servers = bots + 3  # the killed server, its replacement, and the server that its timer ends
-    size, prices = project.size, Prices()
-    spot, on_demand = (prices.server_hour(size.cpu, size.memory, spot=kind) for kind in (True, False))
-    return Usd(spot.low * servers * 2 / 60, spot.likely * servers * 4 / 60, on_demand.high * servers * 20 / 60)
+    size = project.size
+    spot, on_demand = (server_hour(size.cpu, size.memory, spot=kind) for kind in (True, False))
+    return Range(spot.low * servers * 2 / 60, spot.likely * servers * 4 / 60, on_demand.high * servers * 20 / 60)
 
 
 def cost(scene: RehearsalContext, records: Iterable[Server]) -> None:
     """Add the line on what the servers have cost, by their records."""
-    total = spent(records, Prices(), datetime.now(UTC), {})
+    total = spent(records, datetime.now(UTC))
     minutes = total.hours * 60
     text = f"About ${total.usd.likely:.4f} for {total.attempts} servers with {minutes:.0f} minutes together"
-    scene.transcript.good("cost", f"{text}, by list prices of {Prices().region}; the rest is less than a cent.")
+    scene.transcript.good("cost", f"{text}, by list prices of {REGION}; the rest is less than a cent.")
