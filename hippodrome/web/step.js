@@ -1,5 +1,5 @@
 // Step pages work without this script. With it they keep a draft of the answers, say what is happening when the
-// connection is bad, show the number that a slider stands at, and copy a completion code.
+// connection is bad, show the number that a slider stands at, send no slider that nobody has moved, and copy a completion code.
 (() => {
   "use strict";
 
@@ -15,6 +15,9 @@
   const form = document.querySelector("form.page");
   const prefix = "hippodrome:";
   const key = prefix + [page.project, page.user, page.step].join(":");
+
+  // A slider without a starting value is unset until it is moved or tapped: the middle, where it stands, is nobody's answer.
+  const unset = new Map(inForm("input[type=range]:not([value])").map((slider) => [slider, slider.value]));
 
   // The draft
 
@@ -37,7 +40,7 @@
   }
 
   function fields() {
-    return inForm(":is(input, select, textarea)").filter((field) => field.name && !UNKEPT.has(field.type));
+    return inForm(":is(input, select, textarea)").filter((field) => field.name && !UNKEPT.has(field.type) && !unset.has(field));
   }
 
   function valueOf(field) {
@@ -69,9 +72,11 @@
     if (!draft || !Array.isArray(draft.values)) return;
     const values = new Map();
     for (const [name, value] of draft.values) values.set(name, [...(values.get(name) ?? []), value]);
-    for (const field of fields()) {
+    for (const field of [...fields(), ...unset.keys()]) {
       const kept = values.get(nameOf(field));
-      if (kept?.length) setValue(field, kept.shift());
+      if (!kept?.length) continue;
+      setValue(field, kept.shift());
+      unset.delete(field);
     }
   }
 
@@ -197,12 +202,16 @@
     const field = event.target;
     const known = [...notes.keys()].some((each) => each === field || (each.type === "radio" && each.name === field.name));
     if (!known) notes.set(field, noteAt(field));
-    if (notes.has(field)) notes.get(field).textContent = field.validity.valueMissing ? TEXT.answerHere : field.validationMessage;
+    if (notes.has(field)) notes.get(field).textContent = isEmpty(field) ? TEXT.answerHere : field.validationMessage;
     sayMissing();
     if (reported) return;
     reported = true;
     field.focus();
     setTimeout(() => { reported = false; });
+  }
+
+  function isEmpty(field) {
+    return field.validity.valueMissing || unset.has(field);
   }
 
   function noteAt(field) {
@@ -217,7 +226,7 @@
   }
 
   function sayMissing() {
-    const lines = [...notes.keys()].map((field) => [field.validity.valueMissing, nameForPeople(field)]).filter(([, name]) => name);
+    const lines = [...notes.keys()].map((field) => [isEmpty(field), nameForPeople(field)]).filter(([, name]) => name);
     say(lines.map(([empty, name]) => (empty ? TEXT.missing(name) : TEXT.lookAgain(name))).join("\n"), true);
   }
 
@@ -245,9 +254,27 @@
     if (slider.id) output.htmlFor = slider.id;
     slider.replaceWith(box);
     box.append(slider, output);
-    const show = () => { output.textContent = slider.value; };
+    const show = () => { output.textContent = unset.has(slider) ? "–" : slider.value; };
     slider.addEventListener("input", show);
+    slider.addEventListener("click", show);
     show();
+  }
+
+  function markUnset(slider) {
+    slider.classList.add("unset");
+    if (slider.required) slider.setCustomValidity(TEXT.answerHere);
+    const set = () => {
+      unset.delete(slider);
+      slider.classList.remove("unset");
+      slider.setCustomValidity("");
+      onInput();
+    };
+    for (const type of ["input", "click"]) slider.addEventListener(type, set, { once: true });
+  }
+
+  // A slider that a script of the page has moved is sent.
+  function withoutUnset({ formData }) {
+    for (const [slider, middle] of unset) if (slider.value === middle) formData.delete(slider.name);
   }
 
   // Completion codes
@@ -276,7 +303,9 @@
   document.querySelectorAll(".code").forEach(addCopy);
   if (!form) return;
   restoreDraft();
+  [...unset.keys()].forEach(markUnset);
   inForm("input[type=range]").forEach(showNumber);
+  listen("formdata", withoutUnset);
   listen("input", onInput);
   listen("change", onInput);
   listen("submit", onSubmit);

@@ -99,7 +99,7 @@ def test_a_field_may_have_the_name_of_a_property_of_forms(world: World, tab: Any
     tab.fill(".field", "words")
     tab.reload()
     assert tab.input_value(".field") == "words"
-    assert tab.text_content("output") == "50"
+    assert tab.text_content("output") == "–"
     world.source = "<p id=second>Second</p>"
     said = tab.evaluate(
         """() => {
@@ -234,6 +234,52 @@ def test_a_slider_shows_its_number(world: World, tab: Any) -> None:
     tab.focus("#r")
     tab.keyboard.press("ArrowRight")
     assert tab.inner_text("output") == "4"
+
+
+def sent_answers(world: World, tab: Any) -> dict[str, str]:
+    world.source = "<p id=second>Second</p>"
+    tab.click("text=Continue")
+    tab.wait_for_selector("#second")
+    return {name: value for name, value in world.posts[-1].items() if not name.startswith("hippodrome-")}
+
+
+UNSET = "<label for=r>How sure?</label><input type=range name=r id=r min=0 max=10 {}><input name=t id=t>"
+
+
+def test_a_slider_without_a_value_sends_nothing_until_it_is_moved(world: World, tab: Any) -> None:
+    world.source = UNSET.format("")
+    tab.goto(world.url)
+    assert tab.inner_text("output") == "–"
+    tab.fill("#t", "words")
+    tab.reload()
+    assert tab.inner_text("output") == "–", "the draft does not move it"
+    assert sent_answers(world, tab) == {"t": "words"}
+
+
+@pytest.mark.parametrize(("touch", "value"), [("tap", "5"), ("key", "6"), ("script", "9")])
+def test_a_slider_that_was_touched_is_an_answer(world: World, tab: Any, touch: str, value: str) -> None:
+    world.source = UNSET.format("")
+    tab.goto(world.url)
+    if touch == "tap":
+        tab.click("#r")
+        tab.reload()  # the draft has it
+    elif touch == "key":
+        tab.focus("#r")
+        tab.keyboard.press("ArrowRight")
+    else:
+        tab.evaluate("document.querySelector('#r').value = 9")
+    assert sent_answers(world, tab) == {"r": value, "t": ""}
+
+
+def test_a_required_slider_must_be_moved(world: World, tab: Any) -> None:
+    world.source = UNSET.format("required")
+    tab.goto(world.url)
+    tab.click("text=Continue")
+    assert "How sure?" in tab.inner_text(".status")
+    assert world.posts == []
+    tab.click("#r")
+    assert tab.locator(".note").count() == 0
+    assert sent_answers(world, tab) == {"r": "5", "t": ""}
 
 
 def test_a_completion_code_is_copied(world: World, lone_tab: Any) -> None:
