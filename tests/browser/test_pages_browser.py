@@ -99,7 +99,7 @@ def test_a_field_may_have_the_name_of_a_property_of_forms(world: World, tab: Any
     tab.fill(".field", "words")
     tab.reload()
     assert tab.input_value(".field") == "words"
-    assert tab.text_content("output") == "–"
+    assert tab.text_content("output") == "\N{EN DASH}"
     world.source = "<p id=second>Second</p>"
     said = tab.evaluate(
         """() => {
@@ -249,10 +249,10 @@ UNSET = "<label for=r>How sure?</label><input type=range name=r id=r min=0 max=1
 def test_a_slider_without_a_value_sends_nothing_until_it_is_moved(world: World, tab: Any) -> None:
     world.source = UNSET.format("")
     tab.goto(world.url)
-    assert tab.inner_text("output") == "–"
+    assert tab.inner_text("output") == "\N{EN DASH}"
     tab.fill("#t", "words")
     tab.reload()
-    assert tab.inner_text("output") == "–", "the draft does not move it"
+    assert tab.inner_text("output") == "\N{EN DASH}", "the draft does not move it"
     assert sent_answers(world, tab) == {"t": "words"}
 
 
