@@ -34,12 +34,12 @@ from botocore.awsrequest import AWSResponse
 from moto.ecs.models import EC2ContainerServiceBackend
 
 from hippodrome.bots.addresses import OneSite
+from hippodrome.bots.bot import Bot
 from hippodrome.control.certificates.rules import location
 from hippodrome.control.config import read_project
-from hippodrome.control.model.server import Server
 from hippodrome.control.storage.secret import SecretCache
-from hippodrome.deployment.operate.doctor.play import play as whole
-from hippodrome.deployment.operate.doctor.play import scene, walk
+from hippodrome.deployment.operate.doctor import play as rehearsal_with_bots
+from hippodrome.deployment.operate.doctor.play import Play
 from hippodrome.functions import (
     installed,
     next_step,
@@ -375,22 +375,21 @@ def held(
     """
     for name, value in KEYS.items():
         patch.setenv(name, value)
-    patch.setattr(scene, "PAUSE", 0.2)
-    kill = walk.Walk._kill
+    patch.setattr(rehearsal_with_bots, "PAUSE", 0.2)
+    kill = Play._kill
 
-    def killed(walked: walk.Walk) -> Server | None:
-        struck = kill(walked)
-        for bot in walked.all:
+    def killed(walked: Play, victim: Bot) -> None:
+        kill(walked, victim)
+        for bot in walked.bots:
             bot.play = play  # on the next server
-        return struck
 
-    patch.setattr(walk.Walk, "_kill", killed)
-    patch.setattr(walk, "PLAY", UNTIL_KILLED if together else play)
-    patch.setattr(walk, "VICTIM_PLAYS", UNTIL_KILLED)
-    patch.setattr(walk, "STRUCK", 1.0)
-    patch.setattr(walk, "ARRIVALS", 0.1)
+    patch.setattr(Play, "_kill", killed)
+    patch.setattr(rehearsal_with_bots, "PLAY", UNTIL_KILLED if together else play)
+    patch.setattr(rehearsal_with_bots, "VICTIM_PLAYS", UNTIL_KILLED)
+    patch.setattr(rehearsal_with_bots, "STRUCK", 1.0)
+    patch.setattr(rehearsal_with_bots, "ARRIVALS", 0.1)
     with RunningInstallation(folder) as world:
-        patch.setattr(whole, "site", lambda context, project_id: world.where(project_id))
+        patch.setattr(rehearsal_with_bots, "site", lambda context, project_id: world.where(project_id))
         registration = read_project(folder).registration()
         for page in (folder / "steps").iterdir():
             world.put(f"{registration['id']}/steps/{page.name}", page.read_bytes())

@@ -9,7 +9,7 @@ import re
 import shutil
 import ssl
 import urllib.error
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from hippodrome.deployment.aws.hosted_zone import Delegation
 from hippodrome.deployment.core.finding import Finding, Mark, examine
 from hippodrome.deployment.operate.doctor import CHECKS, addresses, capacity, images, safety
 from hippodrome.deployment.operate.doctor.check_context import CheckContext
-from hippodrome.deployment.operate.doctor.rehearsal import Rehearsal
+from hippodrome.deployment.operate.doctor.rehearsal import LoneServer, rehearse
 from hippodrome.deployment.stack.stack import Stack
 from testing.moto_study import StudyOnMoto
 from testing.studies import PAGES, study
@@ -604,13 +604,23 @@ class Clock:
             self.study_functions.deliver_some()
 
 
-def rehearsal(
-    world: Installed, study_functions: StudyOnMoto | None, told: list[str] | None = None, **more: Any
-) -> Rehearsal:
+def rehearsed(
+    world: Installed,
+    study_functions: StudyOnMoto | None,
+    *,
+    whose: Project | None = None,
+    reach: Callable[[str], object] | None = None,
+    told: list[str] | None = None,
+    sleep: Callable[[float], None] | None = None,
+) -> list[Finding]:
     clock = Clock(world, study_functions)
-    whose = msgspec.structs.replace(study(), id="ms-pacman")
+    whose = whose or msgspec.structs.replace(study(), id="ms-pacman")
     tell = told.append if told is not None else lambda _: None
-    return Rehearsal(world.platform, whose, tell, clock=clock, sleep=clock.sleep, **more)
+    findings: list[Finding] = []
+    lone = LoneServer(world.platform, whose, tell, clock=clock, sleep=sleep or clock.sleep)
+    with contextlib.suppress(KeyboardInterrupt):
+        rehearse(lone, whose, findings, reach)
+    return findings
 
 
 def assert_nothing_left(world: Installed) -> None:
@@ -622,7 +632,7 @@ def test_a_rehearsal_starts_a_server_and_leaves_nothing(world: Installed) -> Non
     study_functions, told = StudyOnMoto(world), []
     SecretCache(world.platform.documents).get_or_create()
     before = world.keys()
-    found = rehearsal(world, study_functions, told).run()
+    found = rehearsed(world, study_functions, told=told)
     assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found
     assert "ready after" in found[0].text
     assert any("its name is being made known" in line for line in told)
@@ -637,8 +647,7 @@ def test_a_rehearsal_says_that_it_got_a_warm_server(world: Installed) -> None:
     whose = project(world, id="ms-pacman", warm_servers=1)
     world.register(whose)
     (name,) = world.warm(whose, 1)
-    clock = Clock(world, study_functions)
-    found = Rehearsal(world.platform, whose, clock=clock, sleep=clock.sleep).run()
+    found = rehearsed(world, study_functions, whose=whose)
     assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found
     assert found[0].text.startswith("A warm server of ms-pacman, on Spot: ")
     assert name not in [task.name for task in world.platform.tasks.list()]
@@ -659,7 +668,7 @@ def test_a_rehearsal_of_a_project_with_sessions_starts_the_server_of_a_session(w
         clock.sleep(seconds)
         swept.append(Sweep(world.platform).run().sessions)
 
-    found = Rehearsal(world.platform, whose, clock=clock, sleep=sleep).run()
+    found = rehearsed(world, study_functions, whose=whose, sleep=sleep)
     assert [line.mark for line in found] == [Mark.GOOD, Mark.GOOD], found
     assert set(swept) == {0}
     assert_nothing_left(world)
@@ -680,14 +689,14 @@ def test_a_rehearsal_connects_to_its_server_as_browsers_do(world: Installed) -> 
 
     study_functions = StudyOnMoto(world)
     for reach, mark in ((asked.append, Mark.GOOD), (closed, Mark.LOOK), (distrusted, Mark.BAD)):
-        found = rehearsal(world, study_functions, reach=reach).run()
+        found = rehearsed(world, study_functions, reach=reach)
         assert [line.mark for line in found] == [Mark.GOOD, mark, Mark.GOOD], found
         assert_nothing_left(world)
     assert re.fullmatch(r"https://s[a-z2-7]{20}-1\.servers\.example\.org:5000/", asked[0])
 
 
 def test_a_rehearsal_cleans_up_if_no_function_acts(world: Installed) -> None:
-    found = rehearsal(world, None).run()
+    found = rehearsed(world, None)
     assert "No function acted on the start message" in found[0].text
     assert found[0].mark is Mark.BAD
     assert found[-1].mark is Mark.LOOK
@@ -698,28 +707,26 @@ def test_a_rehearsal_cleans_up_if_no_function_acts(world: Installed) -> None:
 def test_a_rehearsal_says_why_its_server_was_closed(world: Installed) -> None:
     study_functions = StudyOnMoto(world)
     world.fail("ecs:RunTask", "InvalidParameterException", "No such task definition.", times=10)
-    found = rehearsal(world, study_functions).run()
+    found = rehearsed(world, study_functions)
     assert found[0].text == f"The server was closed: {Reason.REFUSED}."
     assert found[0].advice == Cause.DEFINITION.sentence
     assert_nothing_left(world)
 
 
 def test_ctrl_c_in_a_rehearsal_leaves_nothing(world: Installed) -> None:
-    study_functions = StudyOnMoto(world)
-    one = rehearsal(world, study_functions)
-    deliver, slept = one._sleep, 0
+    study_functions, slept = StudyOnMoto(world), 0
+    clock = Clock(world, study_functions)
 
     def sleep(seconds: float) -> None:
         nonlocal slept
         slept += 1
         if slept == 2:
             raise KeyboardInterrupt
-        deliver(seconds)
+        clock.sleep(seconds)
 
-    one._sleep = sleep
-    with pytest.raises(KeyboardInterrupt):
-        one.run()
-    assert [line.mark for line in one.left] == [Mark.GOOD]
+    assert [line.text for line in rehearsed(world, study_functions, sleep=sleep)] == [
+        "It was stopped, and nothing of it is left."
+    ]
     study_functions.deliver()
     assert_nothing_left(world)
 
@@ -731,8 +738,11 @@ def test_a_rehearsal_decides_how_the_command_ends(
     """Other problems are still reported."""
     world.put("SSL/servers.example.org/fullchain.pem", chain("*.servers.example.org", days=-1))
     assert world.run(capsys, "doctor", "--all", "--only-aws").code == Exit.FAILED
-    rehearsed = Finding("rehearsal", mark, "A server was started and stopped.", "Look at the logs.")
-    monkeypatch.setattr("hippodrome.deployment.operate.doctor._rehearse", lambda context: [rehearsed])
+
+    def rehearse(lone: LoneServer, project: Project, findings: list[Finding], reach: object) -> None:
+        findings.append(Finding("rehearsal", mark, "A server was started and stopped.", "Look at the logs."))
+
+    monkeypatch.setattr("hippodrome.deployment.operate.doctor.rehearsal.rehearse", rehearse)
     ran = world.run(capsys, "doctor", "--all", "--only-aws", "--rehearse")
     assert ran.code == code
     assert "✗ certificate: It expired" in ran.out

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 import signal
@@ -20,27 +19,29 @@ import yaml
 from hippodrome.console.problem import Exit
 from hippodrome.control.lobby import decisions
 from hippodrome.control.lobby.decisions import Decisions, OpenSession
+from hippodrome.control.model.balance import cells_key
 from hippodrome.control.model.design import Step
 from hippodrome.control.model.project import MASTER_LIST, MasterList, UnreadableEntry, read_list, write_list
 from hippodrome.control.model.records import to_json
 from hippodrome.control.model.server import ServerState
 from hippodrome.control.storage.project_cache import FRESH
 from hippodrome.deployment.aws.account import find_installation
+from hippodrome.deployment.core.finding import Mark
 from hippodrome.deployment.core.participants import registered_projects
-from hippodrome.deployment.operate.doctor.play import play as whole
-from hippodrome.deployment.operate.doctor.play import upkeep, walk
-from hippodrome.deployment.operate.doctor.play.copy import Copy, changed, left_behind, page_files, remove, unregister
-from hippodrome.deployment.operate.doctor.play.simulated import STAGES
-from hippodrome.deployment.operate.doctor.play.transcript import LINES, Transcript
+from hippodrome.deployment.operate.doctor import play as rehearsal_with_bots
+from hippodrome.deployment.operate.doctor import study_copy
+from hippodrome.deployment.operate.doctor.check_context import CheckContext
+from hippodrome.deployment.operate.doctor.play import KILLED, Play
+from hippodrome.deployment.operate.doctor.study_copy import StudyCopy, changed, left_behind, page_files, unregister
+from hippodrome.deployment.operate.doctor.transcript import LINES, Transcript
 from hippodrome.protocol.keys import session_key
 from hippodrome.protocol.session import Member, SessionDocument
 from testing.aws_events import ACCOUNT
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld
-from testing.simulation import conditions, tasks
 from testing.studies import study
 from testing.waiting import until
-from tests.deployment.installation import ROOT, CommandResult, account_here
+from tests.deployment.installation import ROOT, CommandResult, Installed, account_here
 from tests.deployment.running_installation import RunningInstallation, held
 from tests.e2e.conftest import AGENT, CONFIG, PAGES
 from tests.trial.two_players import two_players
@@ -69,7 +70,7 @@ def write_study(
 @pytest.fixture
 def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningInstallation]:
     """A running installation with one live study."""
-    monkeypatch.setattr(whole, "FRESH", timedelta(0))
+    monkeypatch.setattr(study_copy, "FRESH", timedelta(0))
     with held(write_study(tmp_path / "study"), monkeypatch, play=1.5, email="admin@example.org") as world:
         yield world
 
@@ -77,7 +78,7 @@ def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running
 @pytest.fixture
 def running_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningInstallation]:
     """A running installation with one live study in which two participants play together."""
-    monkeypatch.setattr(whole, "FRESH", timedelta(0))
+    monkeypatch.setattr(study_copy, "FRESH", timedelta(0))
     both = {"players": {"left": "human", "right": "human"}, "countdown": 0, "actionSpace": ["noop", "up", "down"]}
     study = write_study(
         tmp_path / "study",
@@ -117,7 +118,7 @@ def assert_nothing_left(running: RunningInstallation) -> None:
 def test_a_rehearsal_proves_every_line_and_leaves_nothing(
     running: RunningInstallation, capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(whole, "FRESH", FRESH)
+    monkeypatch.setattr(study_copy, "FRESH", FRESH)
     running.visited = f"projectId={STUDY}&userId=somebody"  # then a function has just read the list of projects
     until(lambda: f"{STUDY}/users/somebody/participant.json" in documents(running))
     before, file = documents(running), tmp_path / "transcript.json"
@@ -133,12 +134,7 @@ def test_a_rehearsal_proves_every_line_and_leaves_nothing(
     assert texts["killed"].startswith("The server counted as lost (spot); another was ready")
     assert texts["servers"].startswith("2 ran, 2 of them on Spot")
     assert texts["data"].startswith("8 answers and 3 recordings")
-    stages = next(line["seconds"] for line in told["lines"] if line["key"] == "times")
-    assert {stage: bool(seconds) for stage, seconds in stages.items()} == {
-        stage: stage != "certificate"
-        for stage in STAGES  # this installation has a domain
-    }
-    assert walk.KILLED in running.stopped
+    assert KILLED in running.stopped
     assert running.alarmed == ["ALARM", "OK"]
     # The transcript names no participant and no account, and holds no secret.
     secrets = {*running.secrets, ACCOUNT, running.root_domain, running.env["BUCKET"], running.ids["zone"], "arn:aws"}
@@ -170,8 +166,8 @@ def test_a_failed_line_has_a_remedy_and_the_rest_goes_on(
 ) -> None:
     running.broken["hippodrome-sweep"] = '{"errorType": "KeyError", "errorMessage": "secret"}'
     running.without_alarms = running.without_timers = True
-    monkeypatch.setattr(upkeep, "ACTED", 0.5)
-    monkeypatch.setattr(upkeep, "FIRED", 0.5)
+    monkeypatch.setattr(rehearsal_with_bots, "ACTED", 0.5)
+    monkeypatch.setattr(rehearsal_with_bots, "FIRED", 0.5)
     ran = play(running, capsys, "--json")
     assert ran.code == Exit.FAILED
     told = {line["key"]: line for line in ran.json["transcript"]["lines"]}
@@ -188,14 +184,14 @@ def test_a_failed_line_has_a_remedy_and_the_rest_goes_on(
 def test_ctrl_c_during_the_rehearsal_removes_everything(
     running: RunningInstallation, capsys: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    watch = walk.Walk._watch
+    watch = Play._watch
 
-    def pressed(self: walk.Walk, reports: Any) -> None:
+    def pressed(self: Play, reports: Any) -> None:
         watch(self, reports)
         if any(report.stage == "plays" for report in reports):
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(walk.Walk, "_watch", pressed)
+    monkeypatch.setattr(Play, "_watch", pressed)
     ran = play(running, capsys, "--transcript", str(tmp_path / "transcript.json"))
     assert ran.code == Exit.INTERRUPTED
     assert running.secrets, "servers had been started"
@@ -205,28 +201,32 @@ def test_ctrl_c_during_the_rehearsal_removes_everything(
     assert "data" not in told["proven"]
 
 
-def test_a_rehearsal_that_was_killed_is_removed_by_the_next(running: RunningInstallation, capsys: Any) -> None:
+def doctors_context() -> CheckContext:
     account = account_here()
-    installation = find_installation(account)
-    platform = account.platform(installation)
-    copy = Copy(account, installation, platform)
-    copy.make(registered_projects(platform.documents)[0])
-    walked = copy.user("1")
-    running.put(f"{copy.id}/users/{walked}/answers/1.json", b"{}")
+    return CheckContext(account, find_installation(account), 20, datetime.now(UTC))
+
+
+def test_a_rehearsal_that_was_killed_is_removed_by_the_next(running: RunningInstallation) -> None:
+    context = doctors_context()
+    copy = StudyCopy(context)
+    copy.make(registered_projects(context.platform.documents)[0])
+    running.put(f"{copy.id}/users/{copy.user('1')}/answers/1.json", b"{}")
     running.record(copy.user("2"), ServerState.CLOSED, copy.project)  # only a server's record is left of it
+    running.record(copy.user("3"), ServerState.READY, copy.project)
     now = datetime.now(UTC)
-    assert left_behind(platform.documents, now) == [], "it may be under way"
-    assert left_behind(platform.documents, now + timedelta(hours=3)) == [copy.id]
-    assert remove(account, installation, platform, copy.id) > 5
+    assert left_behind(context, now) == [], "it may be under way"
+    assert left_behind(context, now + timedelta(hours=3)) == [copy.id]
+    unregister(context.platform.documents, copy.id)  # the removal was killed, too
+    assert left_behind(context, now + timedelta(hours=3)) == [copy.id]
+    assert StudyCopy(context, copy.id).remove() > 5
+    assert left_behind(context, now + timedelta(hours=3)) == []
     assert_nothing_left(running)
 
 
-def test_sessions_and_the_lobby_of_a_copy_are_removed_too(running: RunningInstallation) -> None:
-    account = account_here()
-    installation = find_installation(account)
-    platform = account.platform(installation)
-    copy = Copy(account, installation, platform)
-    copy.make(registered_projects(platform.documents)[0])
+def test_sessions_the_lobby_and_the_cells_of_a_copy_are_removed_too(running: RunningInstallation) -> None:
+    context = doctors_context()
+    copy = StudyCopy(context)
+    copy.make(registered_projects(context.platform.documents)[0])
     walked, sid, ahead = copy.user("1"), f"s.{1:020x}", f"s.{2:020x}"
     running.put(f"{copy.id}/users/{walked}/participant.json", b"{}")
     running.put(session_key(copy.id, sid), SessionDocument(sid, 2, (Member(walked, None, 0),)).to_json())
@@ -234,18 +234,16 @@ def test_sessions_and_the_lobby_of_a_copy_are_removed_too(running: RunningInstal
     running.record(ahead, ServerState.READY, copy.project)
     running.put(f"_lobby/{copy.id}/slabel.way", b"{}")
     running.put(decisions.key(copy.id), to_json(Decisions(1, open=(OpenSession(ahead, datetime.now(UTC)),))))
-    remove(account, installation, platform, copy.id, users=copy.users)
+    running.put(cells_key(copy.id), b"{}")
+    copy.remove()
     assert_nothing_left(running)
-    assert running.keys("_lob") == []
+    assert running.keys("_lob") == running.keys("_cells") == []
 
 
 @pytest.mark.parametrize("name", ["rehearsal-20261122", "rehearsal-deadbeef", "rehearsal-1"])
-def test_a_study_whose_id_resembles_that_of_a_copy_is_not_removed(name: str) -> None:
-    theirs = msgspec.structs.replace(study(), id=name)
-    with MotoWorld() as world:
-        documents = world.platform.documents
-        documents.create(MASTER_LIST, write_list(MasterList([theirs])))
-        assert left_behind(documents, datetime.now(UTC) + timedelta(days=1)) == []
+def test_a_study_whose_id_resembles_that_of_a_copy_is_not_removed(installed: Installed, name: str) -> None:
+    installed.put(f"{name}/steps/consent.html", b"")
+    assert left_behind(doctors_context(), datetime.now(UTC) + timedelta(days=1)) == []
 
 
 def test_unreadable_entries_of_the_list_of_projects_stay_unchanged() -> None:
@@ -388,27 +386,12 @@ def test_a_transcript_hides_the_longest_secret_first() -> None:
 
 def test_a_line_that_was_bad_once_is_not_proven() -> None:
     transcript = Transcript()
-    transcript.good("pages", "fine")
-    transcript.good("data", "fine")
-    transcript.bad("pages", "not so fine", "look")
+    transcript.say("pages", Mark.GOOD, "fine")
+    transcript.say("data", Mark.GOOD, "fine")
+    transcript.say("pages", Mark.BAD, "not so fine", "look")
     assert transcript.proven == ["data"]
     with pytest.raises(KeyError):
-        transcript.good("something else", "fine")
-
-
-# The rehearsal and the simulation
-
-
-def test_the_rehearsal_has_the_stages_of_the_simulation() -> None:
-    """`deploy` imports nothing of `bench`, so its own table must be kept equal."""
-    median, sigma, longest = conditions.STARTS
-    usual = tuple(float(round(median * math.exp(sign * 2 * sigma))) for sign in (-1, 1))
-    assert (STAGES["start"].usual, STAGES["start"].most) == (usual, longest)
-    assert STAGES["name"].usual == conditions.PROPAGATION
-    assert STAGES["name"].most == conditions.SLOW_PROPAGATION[1]
-    assert STAGES["certificate"].usual == conditions.AUTHORITY
-    assert STAGES["gone"].usual == tasks.DEPROVISIONED
-    assert STAGES["told"].most == 20 + 1, "Conditions.late: events come 1 to 20 s late"
+        transcript.say("something else", Mark.GOOD, "fine")
 
 
 # What the documentation promises

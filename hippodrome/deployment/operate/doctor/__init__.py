@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import re
+import signal
 from collections.abc import Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +16,7 @@ import typer
 from rich.text import Text
 
 from hippodrome.console import screen
+from hippodrome.console.formatting import count
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.model.project import Project
 from hippodrome.deployment.aws.account import Account, Installation, find_installation, open_account
@@ -19,13 +24,14 @@ from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import explain, options, participants
 from hippodrome.deployment.core.finding import Finding, Mark, bad, examine, good, look, show
 from hippodrome.deployment.core.study_selection import one_or_all
-from hippodrome.deployment.operate.doctor import addresses, capacity, documents, images, safety
+from hippodrome.deployment.cost.prices import REGION
+from hippodrome.deployment.operate.doctor import addresses, capacity, documents, images, rehearsal, safety
 from hippodrome.deployment.operate.doctor.check_context import Check, CheckContext
-from hippodrome.deployment.operate.doctor.play import MAX_BOTS, WITHIN
-from hippodrome.deployment.operate.doctor.rehearsal import CHECK as REHEARSAL
-from hippodrome.deployment.operate.doctor.rehearsal import Rehearsal, project_for
 from hippodrome.deployment.stack import states
 from hippodrome.deployment.stack.stack import Stack
+
+WITHIN = 20  # minutes that a rehearsal with bots may take, without --within; about ten are usual
+MAX_BOTS = 20
 
 CHECKS: dict[str, Check] = {
     "hosted zone": addresses.zone,
@@ -93,12 +99,12 @@ def command(
     if play and not rehearse:
         raise Problem("--play is a kind of rehearsal.", "Say --rehearse --play.")
     project = one_or_all(study, every)
-    rehearsal: list[Finding] = []
-    document: dict[str, Any] = {}
     account = open_account(profile, region)
     findings = [*credentials(account)]
     installation, diagnoses = installation_state(account, stack)
     findings += diagnoses
+    rehearsed: list[Finding] = []
+    document: dict[str, Any] = {}
     if installation is not None:
         context = CheckContext(account, installation, at_once, datetime.now(UTC), fetch=addresses.fetch)
         if only_aws:
@@ -109,21 +115,20 @@ def command(
     if not as_json:
         show(findings, screen.out)
     if installation is not None and rehearse:
-        if play:
-            from hippodrome.deployment.operate.doctor.play.command import played  # noqa: PLC0415 - bots, and what reads data
-
-            rehearsal, document = played(context, play, minutes=within, yes=yes, file=transcript)
-        else:
-            rehearsal = _rehearse(context)
-        findings += rehearsal
+        try:
+            document = _rehearse(context, rehearsed, play, within, transcript, yes=yes)
+        except KeyboardInterrupt:
+            show(rehearsed, screen.err)
+            raise
+        findings += rehearsed
         if not as_json:
-            show(rehearsal, screen.out)
-    failed = any(finding.mark is Mark.BAD for finding in rehearsal or findings)
+            show(rehearsed, screen.out)
+    failed = any(finding.mark is Mark.BAD for finding in rehearsed or findings)
     if as_json:
         more = {"transcript": document} if document else {}
-        screen.result_json({"good": not failed, "checks": [_data(finding) for finding in findings], **more})
+        screen.result_json({"good": not failed, "checks": [asdict(finding) for finding in findings], **more})
     else:
-        _conclude(findings, rehearsal)
+        _conclude(findings, rehearsed)
     return Exit.FAILED if failed else Exit.DONE
 
 
@@ -201,38 +206,75 @@ def _wanted(context: CheckContext, project_id: str | None) -> Project | None:
     return project
 
 
-def _rehearse(context: CheckContext) -> list[Finding]:
-    project = project_for(context)
+def _rehearse(
+    context: CheckContext, findings: list[Finding], bots: int | None, minutes: int, file: Path | None, *, yes: bool
+) -> dict[str, Any]:
+    """Rehearse, with this many bots or with one server alone. Add the findings, and return the transcript.
+
+    SIGTERM and a closed terminal end it as Ctrl-C does, so that everything is removed.
+    """
+    project = next((p for p in context.projects if p.live and p.game_steps and p.task_definition), None)
     if project is None:
-        return [bad(REHEARSAL, "No live project has a game: there is nothing to start.", "Register one with --live.")]
+        text = "No live project has a game: there is nothing to start."
+        findings.append(bad(rehearsal.CHECK, text, "Register one with --live."))
+        return {}
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
+    if bots:
+        return _play(context, project, findings, bots=bots, minutes=minutes, file=file, yes=yes)
+    with _progress() as progress:
+        rehearsal.rehearse(rehearsal.LoneServer(context.platform, project, progress), project, findings, context.fetch)
+    return {}
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[rehearsal.Progress]:
     with screen.err.status("Rehearsing …") as status:
-        rehearsal = Rehearsal(
-            context.platform, project, lambda text: status.update(f"Rehearsing: {text}"), reach=context.fetch
-        )
-        try:
-            return rehearsal.run()
-        except KeyboardInterrupt:
-            status.stop()
-            for finding in rehearsal.left:
-                (screen.success if finding.mark is Mark.GOOD else screen.warning)(
-                    f"{finding.text} {finding.advice}".strip()
-                )
-            raise
-        except Exception as error:
-            problem = explain.problem_from(error)
-            if problem is None:
-                raise
-            return [bad(REHEARSAL, str(problem), problem.advice), *rehearsal.left]
+        yield lambda text: status.update(f"Rehearsing: {text}")
 
 
-def _conclude(findings: list[Finding], rehearsal: list[Finding]) -> None:
-    bads = sum(1 for finding in findings if finding.mark is Mark.BAD)
-    looks = sum(1 for finding in findings if finding.mark is Mark.LOOK)
-    rehearsed = bool(rehearsal) and all(finding.mark is not Mark.BAD for finding in rehearsal)
-    ready = "The rehearsal succeeded" if rehearsed else "" if bads else "Ready"
+def _play(
+    context: CheckContext,
+    project: Project,
+    findings: list[Finding],
+    *,
+    bots: int,
+    minutes: int,
+    file: Path | None,
+    yes: bool,
+) -> dict[str, Any]:
+    """Ask, rehearse, and write the transcript into `file`. Raises `Problem` if the answer is no."""
+    from hippodrome.deployment.operate.doctor.play import Play, estimate  # noqa: PLC0415 - bots, and what reads data
+    from hippodrome.deployment.operate.doctor.transcript import Transcript  # noqa: PLC0415 - as above
+
+    if file is not None and not file.absolute().parent.is_dir():
+        raise Problem(f"There is no folder {file.parent}.", "Make it, or name another file for the transcript.")
+    usd = estimate(project, bots)
+    screen.info(
+        f"{count(bots, 'bot')} and three servers more, about ten minutes, {minutes} at most. "
+        f"It costs about ${usd.likely:.2f}, ${usd.high:.2f} at most (list prices of {REGION}). "
+        f"{project.id} itself is not touched: a copy of it is registered, and removed at the end. "
+        "One alarm is set off: its mail says that it is a rehearsal."
+    )
+    screen.confirm("Begin?", yes)
+    transcript = Transcript()
+    try:
+        with _progress() as progress:
+            Play(context, project, transcript, progress, bots=bots, minutes=minutes).run()
+    finally:
+        findings += transcript.findings
+        document = transcript.document(context.account.region, bots)
+        if file is not None:
+            file.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+            wrong = sum(finding.mark is Mark.BAD for finding in findings)
+            screen.success(f"The transcript is in {file}: {len(transcript.proven)} things proven, {wrong} not.")
+    return document
+
+
+def _conclude(findings: list[Finding], rehearsed: list[Finding]) -> None:
+    bads = sum(finding.mark is Mark.BAD for finding in findings)
+    looks = sum(finding.mark is Mark.LOOK for finding in findings)
+    succeeded = bool(rehearsed) and all(finding.mark is not Mark.BAD for finding in rehearsed)
+    ready = "The rehearsal succeeded" if succeeded else "" if bads else "Ready"
     sentence = f"{bads} to mend, {looks} to look at" if bads else f"{looks} to look at" if looks else ""
     screen.out.print(Text(f"{'; '.join(filter(None, (ready, sentence)))}.", style="bold"))
-
-
-def _data(finding: Finding) -> dict[str, Any]:
-    return {"check": finding.check, "mark": finding.mark, "text": finding.text, "advice": finding.advice}

@@ -1,4 +1,4 @@
-"""The input of the checks of `doctor`, and the exception for a part of a rehearsal that fails."""
+"""The input of the checks of `doctor`."""
 
 from __future__ import annotations
 
@@ -57,14 +57,6 @@ class CheckContext:
     def warm_cpu(self) -> float:
         """The vCPUs of all warm servers together."""
         return sum(p.warm_servers * p.size.cpu for p in self.projects)
-
-
-class CheckFailed(Exception):
-    """A part of a rehearsal has failed. `advice` says what to do."""
-
-    def __init__(self, text: str, advice: str) -> None:
-        super().__init__(text)
-        self.advice = advice
 
 
 Check = Callable[[CheckContext], Iterable[Finding]]

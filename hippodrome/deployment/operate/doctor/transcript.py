@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from datetime import datetime
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
 from typing import Any
 
+from hippodrome.console.problem import Problem
+from hippodrome.deployment.core import explain
 from hippodrome.deployment.core.finding import Finding, Mark
+from hippodrome.deployment.operate.doctor.rehearsal import CheckFailed
 
 SCHEMA = 1
 LINES: Mapping[str, str] = {
@@ -25,7 +27,6 @@ LINES: Mapping[str, str] = {
     "timer": "a server that is not stopped is ended by its timer",
     "sweep": "the sweep removes what no server owns",
     "alarm": "an alarm reaches its topic, and its subscribers",
-    "times": "the stages take about as long as the simulation assumes",
     "erased": "nothing of the rehearsal is left",
     "cost": "what it cost",
 }
@@ -42,31 +43,21 @@ _PATTERNS = (
 )
 HIDDEN = "…"
 LONGEST = 1_000  # characters of a line: parts of it may be an agent's own output
-
-
-@dataclass(frozen=True)
-class TranscriptLine:
-    """One line: its key, mark, text and advice, its time (seconds from the beginning), and what was measured."""
-
-    key: str
-    mark: Mark
-    text: str
-    advice: str = ""
-    at: float = 0.0
-    seconds: Mapping[str, Any] = field(default_factory=dict)
+DEBUG = "Run it again with HIPPODROME_DEBUG=1 and send us what it prints."
 
 
 class Transcript:
-    """Collects the lines of a rehearsal. `clean` removes secrets from every text first."""
+    """Collects the lines of a rehearsal, and removes secrets from every text first."""
 
     def __init__(self) -> None:
-        self.lines: list[TranscriptLine] = []
-        self._began = time.monotonic()
+        self.findings: list[Finding] = []  # by `check`, the key of a line
+        self._at: list[float] = []  # for each, the seconds from the beginning
+        self._began, self._clock = datetime.now(UTC), time.monotonic()
         self._secrets: set[str] = set()
 
     def hide(self, *secrets: str | None) -> None:
-        """Remove these ids, tokens, names and addresses from all later lines. No pattern would find them."""
-        self._secrets.update(secret for secret in secrets if secret)
+        """Remove these names and codes from all later lines. No pattern would find them."""
+        self._secrets.update(filter(None, secrets))
 
     def clean(self, text: str) -> str:
         """Remove ids, tokens, and anything that reveals the account from the text.
@@ -80,59 +71,53 @@ class Transcript:
             text = pattern.sub(HIDDEN, text)
         return text if len(text) <= LONGEST else f"{text[:LONGEST]} {HIDDEN}"
 
-    def say(self, key: str, mark: Mark, text: str, advice: str = "", **seconds: Any) -> None:
-        """Add a line with the figures `seconds`. Raises KeyError if its key is not among `LINES`."""
+    def say(self, key: str, mark: Mark, text: str, advice: str = "") -> None:
+        """Add a line. Raises KeyError if its key is not among `LINES`."""
         LINES[key]
-        at = round(time.monotonic() - self._began, 1)
-        self.lines.append(TranscriptLine(key, mark, self.clean(text), self.clean(advice), at, seconds))
+        self.findings.append(Finding(key, mark, self.clean(text), self.clean(advice)))
+        self._at.append(round(time.monotonic() - self._clock, 1))
 
-    def good(self, key: str, text: str, **seconds: Any) -> None:
-        """Add a line on a result that is good."""
-        self.say(key, Mark.GOOD, text, **seconds)
+    def part(self, key: str, part: Callable[[], str | None]) -> bool:
+        """Run a part of the rehearsal, add the line that it returns, and return whether it succeeded.
 
-    def bad(self, key: str, text: str, advice: str) -> None:
-        """Add a line on a result that is bad, with advice."""
-        self.say(key, Mark.BAD, text, advice)
-
-    def has(self, key: str) -> bool:
-        """Whether there is a line with this key."""
-        return any(line.key == key for line in self.lines)
+        If it has not, the line says why, and what to do.
+        """
+        try:
+            text = part()
+        except CheckFailed as failed:
+            self.say(key, failed.mark, str(failed), failed.advice)
+        except Exception as error:  # noqa: BLE001 - the other parts go on
+            problem = explain.problem_from(error) or Problem(f"{type(error).__name__}: {error}", DEBUG)
+            self.say(key, Mark.BAD, " ".join([str(problem), *problem.details]), problem.advice)
+        else:
+            if text:
+                self.say(key, Mark.GOOD, text)
+            return True
+        return False
 
     @property
-    def findings(self) -> list[Finding]:
-        """The lines as `doctor` shows them."""
-        return [Finding(line.key, line.mark, line.text, line.advice) for line in self.lines]
+    def untried(self) -> list[str]:
+        """The keys without a line."""
+        return [key for key in LINES if key not in {finding.check for finding in self.findings}]
 
     @property
     def proven(self) -> list[str]:
         """The keys of proven results: all their lines are good."""
-        bad = {line.key for line in self.lines if line.mark is not Mark.GOOD}
-        return [key for key in LINES if self.has(key) and key not in bad]
+        wrong = {finding.check for finding in self.findings if finding.mark is not Mark.GOOD}
+        return [key for key in LINES if key not in wrong and key not in self.untried]
 
-    def document(self, began: datetime, region: str, bots: int) -> dict[str, Any]:
+    def document(self, region: str, bots: int) -> dict[str, Any]:
         """Return the transcript as JSON data, for a file."""
         return {
             "schema": SCHEMA,
             "what": "a rehearsal with simulated participants on a real account",
-            "began": began.isoformat(timespec="seconds"),
+            "began": self._began.isoformat(timespec="seconds"),
             "region": region,
             "bots": bots,
             "proven": {key: LINES[key] for key in self.proven},
-            "lines": [_plain(line) for line in self.lines],
+            "lines": [
+                {"key": line.check, "mark": line.mark, "text": line.text, "at": at}
+                | ({"advice": line.advice} if line.advice else {})
+                for line, at in zip(self.findings, self._at, strict=True)
+            ],
         }
-
-
-def _plain(line: TranscriptLine) -> dict[str, Any]:
-    data: dict[str, Any] = {"key": line.key, "mark": str(line.mark), "text": line.text, "at": line.at}
-    if line.advice:
-        data["advice"] = line.advice
-    if line.seconds:
-        data["seconds"] = line.seconds
-    return data
-
-
-def shown(values: Iterable[float]) -> str:
-    """Write the range of these seconds in words: `3 s`, or `3 to 8 s`."""
-    ordered = sorted(values)
-    low, high = ordered[0], ordered[-1]
-    return f"{low:.0f} s" if f"{low:.0f}" == f"{high:.0f}" else f"{low:.0f} to {high:.0f} s"
