@@ -22,8 +22,8 @@ from hippodrome.trial.core import messages
 from hippodrome.trial.core.effects import Call, OpenRecording, RecordLine, ResetPolicy, SaveAnswer, WriteLine
 from hippodrome.trial.core.players import Player, who_plays
 from hippodrome.trial.core.policies import AskPolicy
+from hippodrome.trial.core.recorded import RecordedTrial
 from hippodrome.trial.core.trial import Trial
-from hippodrome.trial.core.unfinished import RecordedTrial
 from hippodrome.trial.policies.places import load_policies
 from hippodrome.trial.recordings.recorder import rules
 from hippodrome.trial.recordings.recording import read_observation, text_of_line

@@ -26,8 +26,8 @@ from hippodrome.trial.core.effects import (
     StepCall,
     StepTaken,
 )
-from hippodrome.trial.core.flow_control import Window
 from hippodrome.trial.core.players import Player, View
+from hippodrome.trial.core.timing import Window
 from hippodrome.trial.core.trial import Trial
 from hippodrome.trial.settings import TrialSettings
 

@@ -5,8 +5,7 @@ import json
 
 import pytest
 
-from hippodrome.trial.core.message_log import Word
-from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.core.recorded import RecordedTrial, Word
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.resume import add_lines
 

@@ -19,9 +19,8 @@ from hippodrome.local.check.one_player import OnePlayer
 from hippodrome.local.check.pace import Pace
 from hippodrome.protocol.trial import TrialSection
 from hippodrome.trial.agent.joint import Joint, JointAdapter
-from hippodrome.trial.core.players import PLAYER, Player, legal_actions
+from hippodrome.trial.core.players import PLAYER, Player, legal_actions, policy_seed
 from hippodrome.trial.core.policies import Observed
-from hippodrome.trial.core.seeds import policy_seed
 from hippodrome.trial.policies.places import load_policies
 from hippodrome.trial.policies.policy import Policy
 from hippodrome.trial.policies.simple import AgentPolicy

@@ -10,13 +10,10 @@ import numpy as np
 
 from hippodrome.trial.agent.calls import Calls, Diverged
 from hippodrome.trial.agent.joint import Joint, JointAdapter
-from hippodrome.trial.core.actions import Action
 from hippodrome.trial.core.effects import Begun, ReplayCall, Replayed, ResetCall, StepCall, StepTaken
-from hippodrome.trial.core.message_log import Word
-from hippodrome.trial.core.players import Player, View
+from hippodrome.trial.core.players import Action, Player, View, policy_seed
 from hippodrome.trial.core.policies import Observed
-from hippodrome.trial.core.seeds import policy_seed
-from hippodrome.trial.core.unfinished import UnfinishedEpisode
+from hippodrome.trial.core.recorded import UnfinishedEpisode, Word
 from hippodrome.trial.recordings import recording
 
 _NONE: frozenset[str] = frozenset()

@@ -12,12 +12,9 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
-from hippodrome.trial.core.actions import Action
-from hippodrome.trial.core.ended import Break, Episode
-from hippodrome.trial.core.message_log import Word
-from hippodrome.trial.core.players import Player, View
+from hippodrome.trial.core.players import Action, Player, View
 from hippodrome.trial.core.policies import AskPolicy, Observed
-from hippodrome.trial.core.unfinished import UnfinishedEpisode
+from hippodrome.trial.core.recorded import Break, Episode, UnfinishedEpisode, Word
 from hippodrome.trial.pictures.picture import Picture
 
 Pictures = Picture | dict[str, Picture]

@@ -10,10 +10,10 @@ from typing import Any
 
 from hippodrome.trial.core import records
 from hippodrome.trial.core.effects import SaveAnswer
-from hippodrome.trial.core.flow_control import Window
 from hippodrome.trial.core.messages import Message
 from hippodrome.trial.core.progress import TrialProgress
 from hippodrome.trial.core.session import TrialSession
+from hippodrome.trial.core.timing import Window
 
 
 class Alone:

@@ -1,10 +1,11 @@
-"""The players of an environment, and who or what chooses the actions of each. Pure."""
+"""The players of an environment, who or what chooses the actions of each, and their actions. Pure."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from hippodrome.protocol.players import GYM_PLAYER, HUMAN
 from hippodrome.protocol.trial import TrialSection
@@ -143,3 +144,39 @@ def random_action(player: Player, mask: Mask | None, seed: int) -> int:
     """Return a random legal action: the same one for the same seed."""
     legal = legal_actions(len(player.action_space), mask)
     return legal[seed % len(legal)] if legal else player.idle
+
+
+By = Literal["human", "policy", "advice", "none", "late", "random"]
+"""Who chose an action. human: a participant. policy: the player's policy. advice: a program at /gym. random: chance,
+because the time of the turn was over. late: no one, because the player's policy has not answered in time. none: no one,
+so the player takes the idle action, or the first legal one if the idle action is illegal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """The action of one player in one step."""
+
+    index: int
+    name: str
+    by: By = "none"
+    observed: int | None = None
+    """The number of steps before the observation with which a policy was asked for this action; None if none was."""
+    acts: bool = True
+    """Whether the player is to act in this step. If not, this is the idle action, for environments that want one."""
+    pressed_at: int | None = None
+    """In a session: when the message came with which the participant chose the action, in nanoseconds; else None."""
+
+    @property
+    def human(self) -> bool:
+        """Whether a participant chose it."""
+        return self.by == "human"
+
+
+SEEDS = 2**31
+"""All seeds are below this number, so that every generator of NumPy and Gymnasium takes them."""
+
+
+def policy_seed(episode_seed: int, player: str) -> int:
+    """Return the seed of a player's policy in an episode: the same for the same arguments on every machine."""
+    digest = hashlib.sha256(f"{episode_seed}\0{player}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") % SEEDS

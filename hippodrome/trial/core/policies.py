@@ -14,8 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hippodrome.trial.core.actions import Action, By
-from hippodrome.trial.core.players import Mask, Player, View, is_legal, legal_or_idle
+from hippodrome.trial.core.players import Action, By, Mask, Player, View, is_legal, legal_or_idle
 
 FAILURES = 3
 """Failures in a row after which a policy is asked no more in the episode."""

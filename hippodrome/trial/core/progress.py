@@ -9,10 +9,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum
 
 from hippodrome.protocol.trial import TrialSection
-from hippodrome.trial.core.actions import Action
 from hippodrome.trial.core.choices import Choices
-from hippodrome.trial.core.ended import PARTNER_LEFT, Break, Episode
-from hippodrome.trial.core.players import Player
+from hippodrome.trial.core.players import Action, Player
+from hippodrome.trial.core.recorded import PARTNER_LEFT, Break, Episode
 
 FAILURES_ALLOWED = 3
 """The trial ends as failed after so many failures of the researcher's code without an episode that ended by itself."""

@@ -14,14 +14,14 @@ from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import Any
 
 from hippodrome.protocol.trial import TrialSection as Config
-from hippodrome.trial.core import ended, messages, records
+from hippodrome.trial.core import messages, recorded, records
 from hippodrome.trial.core.effects import Effect, RecordLine, ResetPolicy, SaveAnswer, SaveMember, WriteLog
-from hippodrome.trial.core.flow_control import Window
+from hippodrome.trial.core.players import policy_seed
 from hippodrome.trial.core.presence import Presence, Rules
 from hippodrome.trial.core.progress import TrialProgress
-from hippodrome.trial.core.recording import Recordings
-from hippodrome.trial.core.seeds import policy_seed
-from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.core.recorded import RecordedTrial
+from hippodrome.trial.core.records import Recordings
+from hippodrome.trial.core.timing import Window
 
 PARTNER_LEFT = (
     "Another participant left, so the game has ended for everyone. This is not your fault. Everything so far is "
@@ -358,7 +358,7 @@ class TrialSession:
         if over is not None:
             return "left" if over == "absent" else "ping"
         stopped_by_another = outcome == "stopped" and self._stopped and player not in self._stopped
-        return ended.PARTNER_LEFT if stopped_by_another else outcome
+        return recorded.PARTNER_LEFT if stopped_by_another else outcome
 
     def reset_fields(self) -> dict[str, Any]:
         """Return further fields for the line of a reset: round trips, and the players whose members are replaced."""
@@ -415,8 +415,8 @@ class TrialSession:
             return PING
         if not self._progress.over:
             return None
-        if self._progress.outcome == "stopped" and self._outcome(player) == ended.PARTNER_LEFT:
+        if self._progress.outcome == "stopped" and self._outcome(player) == recorded.PARTNER_LEFT:
             return PARTNER_STOPPED
-        if self._progress.outcome != ended.PARTNER_LEFT:
+        if self._progress.outcome != recorded.PARTNER_LEFT:
             return None
         return LEFT if over == "absent" else PARTNER_LEFT if self._begun else PARTNER_MISSING

@@ -1,4 +1,4 @@
-"""Decides what is due: a step, a reset, or the end of a turn, a break, a first picture or an episode. Pure.
+"""Decides what is due: a step, a reset, a frame, or the end of a turn, a break, a first picture or an episode. Pure.
 
 All times are seconds of one monotonic clock, which is passed in.
 """
@@ -6,13 +6,67 @@ All times are seconds of one monotonic clock, which is passed in.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping
 from enum import Enum, auto
 from typing import Any, NamedTuple
 
 from hippodrome.protocol.trial import TrialSection
-from hippodrome.trial.core.episode_time import EpisodeTime
 from hippodrome.trial.core.progress import TrialProgress
+from hippodrome.trial.settings import STALLED_SECONDS
+
+_WIDEST = 15  # the most frames under way, however long the round trip is
+
+
+class EpisodeTime:
+    """Measures the times of the present episode, in seconds.
+
+    `freeze`: for how long the episode shows its first picture. `limit`: for how long it may be played; 0: no limit.
+    """
+
+    def __init__(self, freeze: float, limit: float) -> None:
+        self._freeze, self._limit = freeze, limit
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin an episode, which shows its first picture."""
+        self._frozen = self._freeze > 0
+        self._frozen_since: float | None = None
+        self._played = 0.0
+        self._runs_since: float | None = None
+
+    def resume(self, played: float) -> None:
+        """Continue an episode that was played for `played` seconds on an earlier server."""
+        self.begin()
+        self._frozen, self._played = False, played
+
+    def rest(self, now: float) -> None:
+        """Stop all times, since the game is held. The time of the first picture begins anew when it goes on."""
+        if self._runs_since is not None:
+            self._played += now - self._runs_since
+        self._frozen_since = self._runs_since = None
+
+    def starts_in(self, now: float) -> float:
+        """Return the seconds for which the first picture is still shown. They run from the first call on."""
+        if not self._frozen:
+            return 0.0
+        if self._frozen_since is None:
+            self._frozen_since = now
+        left = max(0.0, self._frozen_since + self._freeze - now)
+        self._frozen = left > 0.0
+        return left
+
+    def run(self, now: float) -> None:
+        """Count the time from now on, until `rest`, as played."""
+        if self._runs_since is None:
+            self._runs_since = now
+
+    def left(self, now: float) -> float | None:
+        """Return the seconds of play that are left in the episode; None if it has no limit."""
+        if not self._limit:
+            return None
+        running = 0.0 if self._runs_since is None else now - self._runs_since
+        return max(0.0, self._limit - self._played - running)
 
 
 class Due(Enum):
@@ -57,6 +111,66 @@ class Pacer:
         missed = max(0, int((now - self._due) / interval))
         self._due += missed * interval  # whole intervals: the next frames are due at the same regular times as before
         return self._due
+
+
+class Window:
+    """Limits the frames that were sent and not yet acknowledged: two more than the game shows in one round trip.
+
+    If the client acknowledges several frames at once, one more is allowed, since the first of them waits for the last.
+    A client that has never acknowledged a frame is limited by its write buffer alone.
+    """
+
+    def __init__(self, stalled_seconds: float = STALLED_SECONDS) -> None:
+        self._stalled_seconds = stalled_seconds
+        self._under_way: deque[tuple[int, float, bool]] = deque()  # id, time, and whether it is the id's first message
+        self._round_trip = math.inf  # the shortest round trip so far
+        self._together = False  # whether the last acknowledgement was for several frames
+        self._sent_at = -math.inf
+        self.newest = -1
+        """The id of the last frame sent; -1 before the first."""
+        self.acknowledgements = 0
+        """How many acknowledgements have come for frames that were under way."""
+
+    @property
+    def acknowledging(self) -> bool:
+        """Whether the client has acknowledged a frame."""
+        return self._round_trip < math.inf
+
+    def sent(self, frame_id: int, now: float) -> None:
+        """Note that a message with this frame, or with rows of it, was sent."""
+        self._under_way.append((frame_id, now, frame_id != self.newest))
+        self._sent_at = now
+        self.newest = frame_id
+        if len(self._under_way) > 4 * _WIDEST:  # a client that never acknowledges
+            self._under_way.popleft()
+
+    def acknowledged(self, frame_id: int, now: float) -> None:
+        """Note that the client has shown this frame, and so all frames before it."""
+        frames = 0
+        while self._under_way and self._under_way[0][0] <= frame_id:
+            sent_id, at, first = self._under_way.popleft()
+            frames += first
+            if sent_id == frame_id and first:  # rows of one frame share its id, so they tell no round trip
+                self._round_trip = min(self._round_trip, now - at)
+        if frames:
+            self.acknowledgements += 1
+            self._together = frames > 1
+
+    def wait(self, now: float, rate: int) -> float:
+        """Return the seconds until another frame may be sent; 0 for at once. `rate`: the game's frames per second.
+
+        Ask again after each acknowledgement, which may make the time shorter.
+        """
+        under_way = len(self._under_way)
+        if under_way < 2 or not self.acknowledging:  # the first is the usual case
+            return 0.0
+        if under_way < min(2 + self._together + math.ceil(self._round_trip * rate), _WIDEST):
+            return 0.0
+        return max(0.0, self._sent_at + 1.0 - now)  # at least one frame a second, since an acknowledgement may be lost
+
+    def stalled(self, now: float) -> bool:
+        """Whether the client has stopped acknowledging frames, after it has acknowledged some."""
+        return bool(self._under_way) and now - self._under_way[0][1] > self._stalled_seconds and self.acknowledging
 
 
 class Timing:

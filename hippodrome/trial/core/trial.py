@@ -25,16 +25,15 @@ and the answer), then FINISHED (the answer is stored) or CLOSED (there is no ans
 could not begin).
 
 This module decides what comes next, and passes each event to the part that it concerns. The other modules decide:
-  choices, policies, turns, controls     what each player does at the next step
+  choices, policies, controls            what each player does at the next step
   progress                               episodes, breaks, scores, and how the trial ends
-  timing, episode_time                   when a step is due; when a turn, a break or an episode is over
-  commands                               what a client may ask for, what that does, and why it is refused
-  agent_call                             which call the agent has now, one at a time
+  timing                                 when a step is due; when a turn, a break or an episode is over
   participants, session, presence        who is connected, and whether the game goes on, is held or ends
-  beginning, steps, ending               how an episode begins (also one of an earlier server), goes on and ends
+  episodes                               how an episode begins (also one of an earlier server), goes on and ends; which
+                                         call the agent has now, one at a time
   talk                                   who says what to whom
-  recording, records, message_log        what is recorded, and what the answer holds
-  clients, messages                      what is sent to clients
+  recorded, records                      what is recorded, and what the answer holds
+  clients, messages                      what is sent to clients; what they may ask for, and why it is refused
 
 A player is a place of the environment (`hippodrome/trial/core/players.py`): a human plays it, or a policy. Each
 connection belongs to a human, and each human plays one player.
@@ -48,34 +47,27 @@ from enum import Enum, auto
 from typing import Any, Literal
 
 from hippodrome.trial.core import messages, records
-from hippodrome.trial.core.agent_call import AgentCall
-from hippodrome.trial.core.beginning import Beginning
-from hippodrome.trial.core.clients import LOOK_AGAIN, Client, Clients
-from hippodrome.trial.core.commands import Commands
+from hippodrome.trial.core.clients import LOOK_AGAIN, Client, Clients, Commands
 from hippodrome.trial.core.effects import (
     AgentTimeout,
     Call,
     Effect,
     FeedbackCall,
     ReplayCall,
-    Replayed,
     SendDone,
     StepCall,
     TellAgent,
     WriteLog,
 )
-from hippodrome.trial.core.ending import LAST_CALL_SECONDS, Ending
-from hippodrome.trial.core.flow_control import Window
-from hippodrome.trial.core.message_log import MessageLog
+from hippodrome.trial.core.episodes import LAST_CALL_SECONDS, AgentCall, Episodes
 from hippodrome.trial.core.participants import Alone, Participants
 from hippodrome.trial.core.players import Player, alone
 from hippodrome.trial.core.progress import TrialProgress
-from hippodrome.trial.core.recording import Recordings, words_of
+from hippodrome.trial.core.recorded import MessageLog, RecordedTrial
+from hippodrome.trial.core.records import Recordings, words_of
 from hippodrome.trial.core.session import TrialSession
-from hippodrome.trial.core.steps import Stepper
 from hippodrome.trial.core.talk import Talk
-from hippodrome.trial.core.timing import Due, Timing
-from hippodrome.trial.core.unfinished import RecordedTrial, UnfinishedEpisode
+from hippodrome.trial.core.timing import Due, Timing, Window
 from hippodrome.trial.settings import TrialSettings
 
 EPISODE_FAILED = "Something went wrong, so this game has ended. You will continue with the next game."
@@ -131,12 +123,15 @@ class Trial:
         self._clients = Clients(self.config, self._timing, self._emit, assets)
         self._commands = Commands(self.config, self._clients, self._messages)
         self._agent = AgentCall(self._emit)
-        emit, timing, message_log, recording = self._emit, self._timing, self._messages, self._recording
-        self._beginning = Beginning(
-            settings, timing=timing, recording=recording, message_log=message_log, new_seed=new_seed, emit=emit
+        self._episodes = Episodes(
+            settings,
+            timing=self._timing,
+            recording=self._recording,
+            message_log=self._messages,
+            clients=self._clients,
+            new_seed=new_seed,
+            emit=self._emit,
         )
-        self._steps = Stepper(settings, timing=timing, message_log=message_log, clients=self._clients, emit=emit)
-        self._ending = Ending(settings, timing=timing, recording=recording, message_log=message_log, emit=emit)
         self._participants: Participants = Alone(self.progress, trial_id)
         self.talk: Talk | None = None
         """What participants and the agent say; None if they do not talk, and before the start."""
@@ -157,7 +152,7 @@ class Trial:
     @property
     def played(self) -> bool:
         """Whether the game is over and its last line written. Recordings or the answer may not be stored yet."""
-        return self.finished or (self.progress.over and self._ending.all_written)
+        return self.finished or (self.progress.over and self._episodes.all_written)
 
     @property
     def done(self) -> bool:
@@ -242,7 +237,7 @@ class Trial:
             self.talk.restore(said)
         if recorded is not None:
             self.progress.resume(recorded.ended)
-            self._beginning.unfinished = recorded.unfinished
+            self._episodes.unfinished = recorded.unfinished
             self._timing.seconds = recorded.seconds
         return self.advance(now)
 
@@ -270,7 +265,7 @@ class Trial:
         self._clients.send_controls(client, self.progress, participants, now)
         client.sent = self._clients.state_of(self.progress, player)
         words = participants.sentence(player) or self._failed_words
-        if words is None and self._beginning.begun_again == self.progress.episode and not self.progress.steps:
+        if words is None and self._episodes.begun_again == self.progress.episode and not self.progress.steps:
             words = EPISODE_BEGINS_AGAIN
         if words is not None:
             self._clients.send(client, messages.error(words))
@@ -356,13 +351,14 @@ class Trial:
             return []
         self._now = now
         if isinstance(call, StepCall):
-            self._steps.taken(call, result, self.progress, now)
+            self._episodes.taken(call, result, self.progress, now)
         elif isinstance(call, FeedbackCall):
-            self._ending.record(call, self.progress, self._participants)
+            self._episodes.record(call, self.progress, self._participants)
         elif isinstance(call, ReplayCall):
-            self._replayed(call.unfinished, result)
+            self._episodes.replayed(call.unfinished, result, self.progress, now)
+            self.ready = True
         else:
-            self._steps.began(result, self.progress, now)
+            self._episodes.began(result, self.progress, now)
             self.ready = True
         return self.advance(now)
 
@@ -376,12 +372,12 @@ class Trial:
             kind = type(error).__name__
             text = f"the episode cannot go on where it was and begins again ({kind})"
             self._emit(WriteLog(logging.WARNING, text))
-            self._agent.make(self._beginning.begin_again(self.progress, self._participants))
+            self._agent.make(self._episodes.begin_again(self.progress, self._participants))
         elif isinstance(call, FeedbackCall) and not isinstance(call, StepCall):
             self._recording.agent_failed(error, records.number(self.progress.ended[0]), self.progress.steps)
             if hangs:
                 self._fail(fatal=True)
-            self._ending.record(call, self.progress, self._participants)
+            self._episodes.record(call, self.progress, self._participants)
         else:
             if isinstance(call, StepCall):
                 self._messages.heard(call.heard)  # the messages stay, for the line that ends the episode
@@ -413,7 +409,7 @@ class Trial:
         """Begin the episode, since the recording of the last `OpenRecording` is open."""
         self._now = now
         self._recording.opened()
-        self._agent.make(self._beginning.opened(self.progress, self._participants, self._ns()))
+        self._agent.make(self._episodes.opened(self.progress, self._participants, self._ns()))
         return self.advance(now)
 
     def recording_failed(self, now: float) -> list[Effect]:
@@ -453,7 +449,7 @@ class Trial:
             pass
         if self._agent.call is not None:
             self.wake_at = self._agent.give_up_at
-        elif self.phase is Phase.PLAYING and not self._ending.closing:
+        elif self.phase is Phase.PLAYING and not self._episodes.closing:
             wake_at = self._participants.wake_at(now)
             if wake_at is not None:
                 self.wake_at = wake_at if self.wake_at is None else min(wake_at, self.wake_at)
@@ -466,7 +462,7 @@ class Trial:
 
         Only a trial that is over has an answer.
         """
-        self._commands.closed = self._ending.closing = True
+        self._commands.closed = self._episodes.closing = True
         if self.talk is not None:
             self.talk.close()
         if self._agent.call is not None:
@@ -481,13 +477,13 @@ class Trial:
         """Do the next thing that is due; return whether something else may be due at this time."""
         if self.phase is Phase.PLAYING:
             return self._play()
-        if self.phase is Phase.SAVING and not self._ending.all_written:
+        if self.phase is Phase.SAVING and not self._episodes.all_written:
             self._write_last_lines()
             return True
         return False
 
     def _play(self) -> bool:
-        progress, closing = self.progress, self._ending.closing
+        progress, closing = self.progress, self._episodes.closing
         if not closing:
             self._participants.attend(self._now, self._timing.seconds)
             if self.talk is not None and self.talk.alternates:
@@ -508,22 +504,15 @@ class Trial:
                 self.wake_at = self._now + LOOK_AGAIN
                 return False
             if not self._paused_by(stalled):
-                self._agent.make(self._steps.take(progress, self._now))
+                self._agent.make(self._episodes.take(progress, self._now))
         elif due is Due.RESET:
-            call = self._beginning.begin(progress, self._participants)
+            call = self._episodes.begin(progress, self._participants)
             if call is not None:
                 self._agent.make(call)
         elif due is Due.NOTHING:
             self.wake_at = self._timing.wake_at
             return False
         return True
-
-    def _replayed(self, unfinished: UnfinishedEpisode, replayed: Replayed) -> None:
-        self._beginning.replayed(self.progress, unfinished, replayed)
-        self._steps.show(replayed, self.progress, self._now)
-        self.ready = True
-        self._emit(WriteLog(logging.INFO, f"the game goes on after {len(unfinished.steps)} steps of an earlier server"))
-        self._messages.repeat(unfinished.unheard, self._ns())
 
     def _paused_by(self, stalled: Sequence[Client]) -> bool:
         """Hold the game for the pages that have stopped answering; return whether one of them was here before."""
@@ -535,18 +524,18 @@ class Trial:
 
     def _write_end(self) -> None:
         """Record the end of an episode or a break, after a last call that gives the agent the feedback before it."""
-        call = self._ending.last_feedback(self.progress)
+        call = self._episodes.last_feedback(self.progress)
         if (call.feedback or self.callbacks) and not self._agent.hangs:
             self._agent.make(call)
         else:
-            self._ending.record(call, self.progress, self._participants)
+            self._episodes.record(call, self.progress, self._participants)
 
     def _write_last_lines(self) -> None:
-        self._ending.shut_down_break(self.progress)
+        self._episodes.shut_down_break(self.progress)
         if self.progress.ended:
             self._write_end()
         else:
-            self._ending.write_last(self.progress, self._participants, broken=self.broken)
+            self._episodes.write_last(self.progress, self._participants, broken=self.broken)
 
     def _fail(self, *, fatal: bool) -> None:
         self.progress.failed(fatal=fatal)
@@ -559,7 +548,7 @@ class Trial:
 
     def _left(self, client: Client) -> None:
         self._note("disconnected", client)
-        self._participants.go(client.player, self._now, closing=self._ending.closing)
+        self._participants.go(client.player, self._now, closing=self._episodes.closing)
         self._tell("on_leave", client.player)
         if self.talk is not None:
             self.talk.disconnected(client.player)

@@ -15,7 +15,7 @@ from hippodrome.protocol.keys import answer_key
 from hippodrome.protocol.trial import TrialSection
 from hippodrome.trial.core.effects import OpenRecording
 from hippodrome.trial.core.players import Player
-from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.core.recorded import RecordedTrial
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.recording import Recording
 from hippodrome.trial.recordings.resume import load_recorded

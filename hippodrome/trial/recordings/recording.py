@@ -7,7 +7,7 @@ failed), `end` (an episode ends, or the server must end), `break` (a break ends)
 
 A `step` says how its action was chosen. `human` is the number of the action that the participant's keys chose (null if
 no key acted). `action` and `actionName` are the action taken. `by` is who chose it: `agent` (the agent reports the
-action as its own, even if it is the human's), or one of `hippodrome.trial.core.actions.By`. Times are UTC:
+action as its own, even if it is the human's), or one of `hippodrome.trial.core.players.By`. Times are UTC:
 2026-11-21T14:46:40.123456Z. docs/data.md describes all fields.
 """
 

@@ -14,10 +14,16 @@ from dataclasses import replace
 from itertools import count
 from typing import Any
 
-from hippodrome.trial.core.ended import PARTNER_LEFT, Episode
-from hippodrome.trial.core.message_log import Word
 from hippodrome.trial.core.messages import is_feedback
-from hippodrome.trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
+from hippodrome.trial.core.recorded import (
+    PARTNER_LEFT,
+    Episode,
+    RecordedAction,
+    RecordedStep,
+    RecordedTrial,
+    UnfinishedEpisode,
+    Word,
+)
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.store import Store
 

@@ -50,8 +50,8 @@ from hippodrome.trial.core.effects import (
 from hippodrome.trial.core.messages import Message
 from hippodrome.trial.core.players import Player, PlayersError
 from hippodrome.trial.core.policies import AskPolicy
+from hippodrome.trial.core.recorded import RecordedTrial
 from hippodrome.trial.core.trial import Trial
-from hippodrome.trial.core.unfinished import RecordedTrial
 from hippodrome.trial.llm.endpoint import Endpoint, Game
 from hippodrome.trial.llm.errors import ModelError
 from hippodrome.trial.llm.ledger import Ledger, Moment

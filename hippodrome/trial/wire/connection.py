@@ -16,7 +16,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from hippodrome.trial.core import messages
-from hippodrome.trial.core.flow_control import Window
+from hippodrome.trial.core.timing import Window
 from hippodrome.trial.pictures import frames
 from hippodrome.trial.pictures.assets import Assets
 from hippodrome.trial.pictures.encoder import Encoder

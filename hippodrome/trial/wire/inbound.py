@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from hippodrome.trial.core import messages
-from hippodrome.trial.core.flow_control import Window
 from hippodrome.trial.core.messages import BadMessage, CloseConnection, Message, NotAMessage
+from hippodrome.trial.core.timing import Window
 from hippodrome.trial.wire import plain
 
 MESSAGES_A_SECOND = 200

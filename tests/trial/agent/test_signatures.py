@@ -16,9 +16,8 @@ from hippodrome.trial.agent import signatures
 from hippodrome.trial.agent.agent import AgentAdapter, AgentError, read_step_result
 from hippodrome.trial.agent.calls import AgentCalls
 from hippodrome.trial.agent.starting import start
-from hippodrome.trial.core.actions import Action
 from hippodrome.trial.core.effects import StepCall
-from hippodrome.trial.core.players import PLAYER
+from hippodrome.trial.core.players import PLAYER, Action
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.recording import text_of_line
 

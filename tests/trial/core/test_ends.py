@@ -22,11 +22,9 @@ from hippodrome.trial.core.effects import (
     WriteLine,
     WriteLog,
 )
-from hippodrome.trial.core.ended import Break, Episode
-from hippodrome.trial.core.message_log import Word
 from hippodrome.trial.core.players import PLAYER, alone
+from hippodrome.trial.core.recorded import Break, Episode, RecordedTrial, UnfinishedEpisode, Word
 from hippodrome.trial.core.trial import TRIAL_FAILED, Phase
-from hippodrome.trial.core.unfinished import RecordedTrial, UnfinishedEpisode
 from tests.trial.core.trial_driver import FRAME, SPACE, STEPS, Driver, recorded, sent
 
 # ---- episodes and the end

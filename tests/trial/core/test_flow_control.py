@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hippodrome.trial.core.clients import Client
-from hippodrome.trial.core.flow_control import Window
+from hippodrome.trial.core.timing import Window
 from hippodrome.trial.settings import STALLED_SECONDS
 
 

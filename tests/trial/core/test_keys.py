@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from hippodrome.trial.core import messages
 from hippodrome.trial.core.controls import KEY, Controls
 from hippodrome.trial.core.effects import RecordLine, SendMessage, SendState, StepCall
-from hippodrome.trial.core.ended import Episode
-from hippodrome.trial.core.episode_time import EpisodeTime
-from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.core.recorded import Episode, RecordedTrial
+from hippodrome.trial.core.timing import EpisodeTime
 from hippodrome.trial.recordings.resume import add_lines
 from tests.trial.core.trial_driver import Driver
 

@@ -8,12 +8,11 @@ import pytest
 
 from hippodrome.trial.core import messages
 from hippodrome.trial.core.effects import AskPolicy, RecordLine, ResetCall, ResetPolicy, SaveMember, SendDone, WriteLog
-from hippodrome.trial.core.flow_control import Window
-from hippodrome.trial.core.message_log import MESSAGES_KEPT
-from hippodrome.trial.core.seeds import policy_seed
+from hippodrome.trial.core.players import policy_seed
+from hippodrome.trial.core.recorded import MESSAGES_KEPT, RecordedTrial
 from hippodrome.trial.core.session import LEFT, PARTNER_LEFT, PARTNER_MISSING, PARTNER_STOPPED, PING
+from hippodrome.trial.core.timing import Window
 from hippodrome.trial.core.trial import TRIAL_FAILED, Trial
-from hippodrome.trial.core.unfinished import RecordedTrial
 from hippodrome.trial.recordings.resume import add_lines
 from hippodrome.trial.settings import STALLED_SECONDS
 from tests.trial.session_driver import SessionDriver

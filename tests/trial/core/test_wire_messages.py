@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hippodrome.trial.core import commands, messages
+from hippodrome.trial.core import clients, messages
 from hippodrome.trial.core.controls import Controls
 from hippodrome.trial.pictures import frames
 from hippodrome.trial.server.watchdog import Watchdog
@@ -95,7 +95,7 @@ def test_a_message_is_read_and_recorded(fields, message, recorded):
 def test_feedback_and_commands_are_those_of_docs_wire():
     assert sorted(messages.FEEDBACK) == ["bad", "good", "trainOffline", "trainOnline"]
     assert sorted(messages.PLAIN_COMMANDS) == ["pause", "requestUI", "reset", "start", "stop"]
-    assert sorted(commands.ALWAYS_ALLOWED) == ["requestUI", "start"]
+    assert sorted(clients.ALWAYS_ALLOWED) == ["requestUI", "start"]
 
 
 @pytest.mark.parametrize(
@@ -335,7 +335,7 @@ def test_a_connection_is_closed_with_a_code_and_words():
     ],
 )
 def test_a_message_whose_control_is_missing_in_ui_is_not_offered(said, ui, missing):
-    assert commands.not_offered(messages.Message(**said), ui) == missing
+    assert clients.not_offered(messages.Message(**said), ui) == missing
 
 
 @pytest.mark.parametrize(

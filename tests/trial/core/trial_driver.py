@@ -15,11 +15,10 @@ from hippodrome.trial.core.effects import (
     StepCall,
     StepTaken,
 )
-from hippodrome.trial.core.ended import Episode
-from hippodrome.trial.core.flow_control import Window
 from hippodrome.trial.core.players import PLAYER, alone
+from hippodrome.trial.core.recorded import Episode, RecordedStep, RecordedTrial, UnfinishedEpisode
+from hippodrome.trial.core.timing import Window
 from hippodrome.trial.core.trial import Trial
-from hippodrome.trial.core.unfinished import RecordedStep, RecordedTrial, UnfinishedEpisode
 from hippodrome.trial.settings import TrialSettings
 
 SPACE = ("noop", "up", "right")

@@ -18,8 +18,8 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
 from onnx import TensorProto, helper, save
 
 from hippodrome.protocol.players import ONNXRUNTIME
+from hippodrome.trial.core.players import policy_seed
 from hippodrome.trial.core.policies import Observed
-from hippodrome.trial.core.seeds import policy_seed
 from hippodrome.trial.policies.load import load
 from hippodrome.trial.policies.policy import PolicyError
 from hippodrome.trial.policies.thread import PolicyThread

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hippodrome.trial.core.flow_control import Window
-from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.core.recorded import RecordedTrial
+from hippodrome.trial.core.timing import Window
 from testing.exploration import examples
 from tests.trial import repeated
 from tests.trial.repeated import repeat

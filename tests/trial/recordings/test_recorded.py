@@ -15,9 +15,7 @@ import attrs
 import numpy as np
 import pytest
 
-from hippodrome.trial.core.ended import Episode
-from hippodrome.trial.core.message_log import Word
-from hippodrome.trial.core.unfinished import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
+from hippodrome.trial.core.recorded import Episode, RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode, Word
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.resume import add_lines, load_recorded
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from hippodrome.protocol.session import Member
 from hippodrome.trial.core.effects import ResetPolicy
-from hippodrome.trial.core.flow_control import Window
-from hippodrome.trial.core.unfinished import RecordedTrial
+from hippodrome.trial.core.recorded import RecordedTrial
+from hippodrome.trial.core.timing import Window
 from hippodrome.trial.settings import TrialSettings
 from testing.exploration import examples
 from tests.trial import repeated

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from hippodrome.trial.core.flow_control import Window
 from hippodrome.trial.core.messages import BadMessage, CloseConnection
+from hippodrome.trial.core.timing import Window
 from hippodrome.trial.wire.inbound import MESSAGES_A_SECOND, Inbound
 
 
