@@ -21,12 +21,14 @@ HEADROOM = 4  # standard deviations above the mean: requests come at random, and
 
 def fargate(context: CheckContext) -> Iterator[Finding]:
     """Compare the vCPU quotas, on Spot and on demand, with what all servers need together, warm ones included."""
-    cpu = context.cpu or (0 if context.projects else USUAL)
+    cpu = max((p.size.cpu for p in context.projects if p.game_steps), default=0.0 if context.projects else USUAL)
     if not cpu:
         yield good("Fargate quotas", "No project needs servers.")
         return
-    need = context.at_once * cpu + context.warm_cpu
-    beside = f" beside {count(context.warm, 'warm one')}" if context.warm else ""
+    warm = sum(p.warm_servers for p in context.projects)  # they run beside the servers that participants use
+    warm_cpu = sum(p.warm_servers * p.size.cpu for p in context.projects)
+    need = context.at_once * cpu + warm_cpu
+    beside = f" beside {count(warm, 'warm one')}" if warm else ""
     for kind, quota in (("Spot", quotas.SPOT), ("on demand", quotas.ON_DEMAND)):
         check = f"Fargate quota, {kind}"
         value = quotas.applied(context.account, quota)
@@ -35,7 +37,7 @@ def fargate(context: CheckContext) -> Iterator[Finding]:
                 check, "Service Quotas does not tell it.", f"Look at quota {quota.code} of Fargate in its console."
             )
             continue
-        servers = int(max(0.0, value - context.warm_cpu) // cpu)
+        servers = int(max(0.0, value - warm_cpu) // cpu)
         text = f"{value:g} vCPU: {servers:,} servers of {cpu:g} vCPU at once{beside}"
         more = quotas.ask_for(context.account, quota, math.ceil(need))
         if value >= need:
@@ -52,11 +54,12 @@ def functions(context: CheckContext) -> Iterator[Finding]:
     """Check Lambda's concurrent executions, which the whole account shares."""
     free = concurrency.unreserved(context.account)
     workers = concurrency.workers(free)
-    waiting = context.at_once * context.players
-    mean = (IN_LOBBY if context.players > 1 else REQUESTS) * waiting
+    players = max((p.players for p in context.projects if p.game_steps), default=1)
+    waiting = context.at_once * players
+    mean = (IN_LOBBY if players > 1 else REQUESTS) * waiting
     need = workers + math.ceil(mean + HEADROOM * math.sqrt(mean))
     more = quotas.ask_for(context.account, quotas.EXECUTIONS, 1000)
-    whom = f" for {waiting:,} participants of {context.at_once:,} servers" if context.players > 1 else ""
+    whom = f" for {waiting:,} participants of {context.at_once:,} servers" if players > 1 else ""
     if free >= need:
         yield good("Lambda quota", f"{free:,} executions at once; about {need:,} are wanted{whom}.")
     elif free > workers:

@@ -38,25 +38,5 @@ class CheckContext:
             return [self.wanted]
         return [p for p in participants.registered_projects(self.platform.documents, []) if p.live]
 
-    @cached_property
-    def cpu(self) -> float:
-        """The vCPUs of the largest server of these projects; 0 if none has a game."""
-        return max((p.size.cpu for p in self.projects if p.game_steps), default=0.0)
-
-    @cached_property
-    def players(self) -> int:
-        """The largest number of participants who share a server in these projects."""
-        return max((p.players for p in self.projects if p.game_steps), default=1)
-
-    @cached_property
-    def warm(self) -> int:
-        """The number of warm servers that these projects keep. They run beside the servers that participants use."""
-        return sum(p.warm_servers for p in self.projects)
-
-    @cached_property
-    def warm_cpu(self) -> float:
-        """The vCPUs of all warm servers together."""
-        return sum(p.warm_servers * p.size.cpu for p in self.projects)
-
 
 Check = Callable[[CheckContext], Iterable[Finding]]

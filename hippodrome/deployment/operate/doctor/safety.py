@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 from botocore.exceptions import ClientError
 
@@ -25,52 +26,38 @@ def bucket(context: CheckContext) -> Iterator[Finding]:
         if status == 404:
             yield bad("bucket", f"{name} is gone, and the data with it.", "See the S3 console; older copies may exist.")
         elif status == 403:
-            yield bad(
-                "bucket", f"{name} may not be looked at, or belongs to another account.", "Check the credentials."
-            )
+            text = f"{name} may not be looked at, or belongs to another account."
+            yield bad("bucket", text, "Check the credentials.")
         else:
             raise
         return
-    wrong = [*_public_access(context, name), *_versions_and_policy(context, name)]
-    yield from wrong
-    if not wrong:
+    block = _unless("NoSuchPublicAccessBlockConfiguration", lambda: client.get_public_access_block(Bucket=name))
+    settings = ("BlockPublicAcls", "IgnorePublicAcls", "BlockPublicPolicy", "RestrictPublicBuckets")
+    off = [setting for setting in settings if not block.get("PublicAccessBlockConfiguration", {}).get(setting)]
+    versioned = client.get_bucket_versioning(Bucket=name).get("Status") == "Enabled"
+    policy = _unless("NoSuchBucketPolicy", lambda: client.get_bucket_policy(Bucket=name)).get("Policy", "{}")
+    only_tls = any(map(_denies_without_tls, json.loads(policy).get("Statement", [])))
+    if off:
+        yield bad("bucket", f"Public access to {name} is not blocked ({', '.join(off)}).", APPLY)
+    if not versioned:
+        yield look("bucket", f"{name} keeps no older versions: what is deleted is gone.", APPLY)
+    if not only_tls:
+        yield bad("bucket", f"{name} can be read without TLS.", APPLY)
+    if not off and versioned and only_tls:
         yield good("bucket", f"{name}: private, versioned, TLS only.")
 
 
-def _public_access(context: CheckContext, name: str) -> Iterator[Finding]:
-    client = context.account.client("s3")
+def _unless(code: str, ask: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return AWS's answer; {} if it is this error."""
     try:
-        block = client.get_public_access_block(Bucket=name)["PublicAccessBlockConfiguration"]
+        return ask()
     except ClientError as error:
-        if errors.code(error) != "NoSuchPublicAccessBlockConfiguration":
+        if errors.code(error) != code:
             raise
-        block = {}
-    settings = ("BlockPublicAcls", "IgnorePublicAcls", "BlockPublicPolicy", "RestrictPublicBuckets")
-    off = [setting for setting in settings if not block.get(setting)]
-    if off:
-        yield bad("bucket", f"Public access to {name} is not blocked ({', '.join(off)}).", APPLY)
+        return {}
 
 
-def _versions_and_policy(context: CheckContext, name: str) -> Iterator[Finding]:
-    client = context.account.client("s3")
-    if client.get_bucket_versioning(Bucket=name).get("Status") != "Enabled":
-        yield look("bucket", f"{name} keeps no older versions: what is deleted is gone.", APPLY)
-    try:
-        policy = json.loads(client.get_bucket_policy(Bucket=name)["Policy"])
-    except ClientError as error:
-        if errors.code(error) != "NoSuchBucketPolicy":
-            raise
-        policy = {}
-    statements = policy.get("Statement", [])
-    statements = [statements] if isinstance(statements, dict) else statements
-    if not any(_denies_without_tls(statement) for statement in statements):
-        yield bad("bucket", f"{name} can be read without TLS.", APPLY)
-    for one in statements:
-        if one.get("Effect") == "Allow" and one.get("Principal") in ("*", {"AWS": "*"}) and not one.get("Condition"):
-            yield bad("bucket", f"The policy of {name} lets everybody in.", "Take that statement out of it.")
-
-
-def _denies_without_tls(statement: dict[str, object]) -> bool:
+def _denies_without_tls(statement: dict[str, Any]) -> bool:
     condition = json.dumps(statement.get("Condition", {})).lower().replace(" ", "")
     return statement.get("Effect") == "Deny" and '"aws:securetransport":"false"' in condition
 
@@ -112,15 +99,12 @@ def alarms(context: CheckContext) -> Iterator[Finding]:
 
 def listeners(context: CheckContext) -> Iterator[Finding]:
     """Check whether the alarms' topic has a confirmed subscription."""
-    subscriptions = [*snapshot.subscriptions(context.account, context.installation)]
-    pending = [
-        subscription["Endpoint"]
-        for subscription in subscriptions
-        if subscription["SubscriptionArn"] == "PendingConfirmation"
-    ]
-    confirmed = [
-        subscription["Endpoint"] for subscription in subscriptions if subscription["SubscriptionArn"].startswith("arn:")
-    ]
+    subscriptions = {
+        line["Endpoint"]: line["SubscriptionArn"]
+        for line in snapshot.subscriptions(context.account, context.installation)
+    }
+    pending = [address for address, arn in subscriptions.items() if arn == "PendingConfirmation"]
+    confirmed = [address for address, arn in subscriptions.items() if arn.startswith("arn:")]
     if pending:
         yield look("alarm e-mail", f"{', '.join(pending)} has not confirmed.", "Follow the link in AWS's e-mail.")
     if confirmed:
