@@ -12,9 +12,13 @@ import html
 import json
 import re
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from typing import Any
 from urllib.parse import urlencode
 
+from hippodrome.control.http import Request
+from hippodrome.control.model.project import Project
+from hippodrome.control.participants.visit import Visit
 from hippodrome.functions import installed, next_step
 from testing.aws_events import FORM, JSON, http_event
 from testing.fake_platform import FakePlatform
@@ -38,6 +42,11 @@ def hidden(page: str) -> dict[str, str]:
         name: html.unescape(value)
         for name, value in re.findall(r'<input type="hidden" name="([^"]+)" value="([^"]*)"', page)
     }
+
+
+def visit_of(project: Project, now: datetime = datetime(2026, 11, 21, 12, tzinfo=UTC)) -> Visit:
+    """Return a visit of alice's, for tests of what `next_step` calls."""
+    return Visit(Request("GET", "/next", (), {}), project, "alice", now)
 
 
 class Browser:

@@ -11,12 +11,12 @@ from hippodrome.control.config import read_project
 from hippodrome.control.http import Response
 from hippodrome.control.model import step_types
 from hippodrome.control.model.design import Step
-from hippodrome.control.model.project import Project
 from hippodrome.control.model.step_types import PAGE, RESERVED, StepType
 from hippodrome.control.participants import steps
 from hippodrome.control.participants.forms import PostedForm
+from hippodrome.control.participants.path import Stop
 from hippodrome.control.participants.steps.page import PageStep
-from hippodrome.control.participants.steps.visit import Visit
+from hippodrome.control.participants.visit import Visit
 from hippodrome.functions import installed as place
 from hippodrome.local.check.project import check_project
 from testing.studies import installed, study
@@ -29,18 +29,17 @@ def test_every_type_has_a_handler_in_a_file_of_its_name() -> None:
     assert set(steps.HANDLERS) == {kind.name for kind in (PAGE, *RESERVED.values())}
     for name, handler in steps.HANDLERS.items():
         assert handler.__module__ == f"hippodrome.control.participants.steps.{name}"
-    shared = {"services", "sources", "visit", "shared_game", "end"}
-    assert {path.stem for path in FOLDER.glob("*.py")} == {*steps.HANDLERS, *shared, "__init__"}
+    assert {path.stem for path in FOLDER.glob("*.py")} == {*steps.HANDLERS, "shared_game", "__init__"}
 
 
 class BreakStep(PageStep):
     """A type without a file of the researcher's: it shows a sentence, and any form leads to the next step."""
 
-    def show(self, visit: Visit) -> Response:
-        return http.html(200, f"<p>Take a break, {visit.user_id}.</p>", {})
+    def show(self, stop: Stop) -> Response:
+        return http.html(200, f"<p>Take a break, {stop.visit.user_id}.</p>", {})
 
-    def post(self, project: Project, user_id: str, step: Step, form: PostedForm) -> None:
-        super().post(project, user_id, step, PostedForm({"rested": "yes"}))
+    def post(self, visit: Visit, step: Step, form: PostedForm) -> None:
+        super().post(visit, step, PostedForm({"rested": "yes"}))
 
 
 @pytest.fixture

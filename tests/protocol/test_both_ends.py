@@ -38,6 +38,7 @@ from hippodrome.trial.settings import SettingsError, TrialSettings, trial_sectio
 from testing.fake_platform import FakePlatform
 from testing.servers import Servers
 from testing.studies import installed, study
+from testing.visitors import visit_of
 
 ROOT = Path(__file__).parents[2]
 VARIABLES = {value for name, value in vars(environment).items() if name.isupper() and isinstance(value, str)}
@@ -181,12 +182,12 @@ def test_the_control_plane_reads_a_trials_answer_and_the_participant_goes_on(tmp
     key = path.relative_to(tmp_path).as_posix()
     assert key == answer_key("maze", "alice", "3") == "maze/users/alice/answers/3.json"
     platform.documents.put(key, path.read_bytes())
-    answers = Answers(platform)
-    assert answers.read("maze", "alice", "3") == played
+    answers, visit = Answers(platform.documents), visit_of(project)
+    assert answers.read(visit, "3") == played
     assert "3" in Repository(platform.documents).progress("maze", "alice").answered
     found = json.loads(path.read_bytes())
     assert (found["step"], found["page"], found["group"], found["schema"]) == ("3", "game", 1, 1)
-    answers.store(project, "alice", project.steps[0], {"age": "30"})
+    answers.store(visit, project.steps[0], {"age": "30"})
     written = json.loads(platform.documents.kept[answer_key("maze", "alice", project.steps[0].key)][0])
     assert written.keys() == found.keys()
     stored = datetime.fromisoformat(written["answered"]), datetime.fromisoformat(found["answered"])
@@ -222,7 +223,7 @@ def test_both_ends_read_the_same_answers_in_a_document(name: str, tmp_path: Path
     env = {"PROJECT_ID": "maze", "USER_ID": "alice", "SERVER": "a-1", "TOKEN": "t", "GAME_STEPS": "3"}
     settings = TrialSettings.from_env({**env, "STORE": str(tmp_path), "TLS": "off", "TRIAL": "{}", "GROUP": "1"})
     recorder = Recorder(settings, "3", "the-trial", store, Spool(settings, store))
-    assert Answers(platform).read("maze", "alice", "3") == ANSWERS.get(name, {})
+    assert Answers(platform.documents).read(visit_of(study()), "3") == ANSWERS.get(name, {})
     assert asyncio.run(recorder.earlier_answers()) == ANSWERS.get(name, {})
     assert ("holds no answers" in log.getvalue()) is (name not in ANSWERS)
 

@@ -16,8 +16,8 @@ from hippodrome.control.log import logger
 from hippodrome.control.model import participant
 from hippodrome.control.model.design import Step
 from hippodrome.control.model.participant import Progress
-from hippodrome.control.model.project import Project
-from hippodrome.control.ports import Conflict, Platform
+from hippodrome.control.participants.visit import Visit
+from hippodrome.control.ports import Conflict, Documents
 from hippodrome.protocol.answer import answers_in
 from hippodrome.protocol.keys import answer_key
 
@@ -25,40 +25,39 @@ from hippodrome.protocol.keys import answer_key
 class Answers:
     """The answers of all participants. A method makes one AWS call unless its docstring says otherwise."""
 
-    def __init__(self, platform: Platform) -> None:
-        self._platform = platform
+    def __init__(self, documents: Documents) -> None:
+        self._documents = documents
 
-    def store(self, project: Project, user_id: str, step: Step, answers: Mapping[str, Any]) -> None:
+    def store(self, visit: Visit, step: Step, answers: Mapping[str, Any]) -> None:
         """Store the answers to a step, which moves the participant on. An answer that the step has already stays."""
-        if self._create(project, user_id, step, answers, answer_key(project.id, user_id, step.key)):
-            logger.info("answered", extra={"project": project.id, "step": step.key})
+        if self._create(visit, step, answers, answer_key(visit.project.id, visit.user_id, step.key)):
+            logger.info("answered", extra={"project": visit.project.id, "step": step.key})
 
-    def store_try(self, project: Project, user_id: str, step: Step, number: int, answers: Mapping[str, Any]) -> None:
+    def store_try(self, visit: Visit, step: Step, number: int, answers: Mapping[str, Any]) -> None:
         """Store the answers of a try at a check. Each try is stored once, so going back gives no further try."""
-        self._create(project, user_id, step, answers, participant.try_key(project.id, user_id, step.key, number))
+        self._create(visit, step, answers, participant.try_key(visit.project.id, visit.user_id, step.key, number))
 
-    def _create(self, project: Project, user_id: str, step: Step, answers: Mapping[str, Any], key: str) -> bool:
-        record = participant.new_answer(project, user_id, step, answers, self._platform.now())
+    def _create(self, visit: Visit, step: Step, answers: Mapping[str, Any], key: str) -> bool:
+        record = participant.new_answer(visit.project, visit.user_id, step, answers, visit.now)
         try:
-            self._platform.documents.create(key, msgspec.json.format(msgspec.json.encode(record), indent=1))
+            self._documents.create(key, msgspec.json.format(msgspec.json.encode(record), indent=1))
         except Conflict:
             return False
         return True
 
-    def read(self, project_id: str, user_id: str, step: str) -> Mapping[str, Any]:
+    def read(self, visit: Visit, step: str) -> Mapping[str, Any]:
         """Return the participant's answers at a step; empty if there are none, or if the document holds no answers."""
-        document = self._platform.documents.get(answer_key(project_id, user_id, step))
+        document = self._documents.get(answer_key(visit.project.id, visit.user_id, step))
         answers = answers_in(document.body) if document else {}
         if answers is None:
-            logger.warning("an answer's document holds no answers", extra={"project": project_id, "step": step})
+            logger.warning("an answer's document holds no answers", extra={"project": visit.project.id, "step": step})
         return answers or {}
 
-    def repeats(self, project: Project, user_id: str, progress: Progress, answers: Mapping[str, Any]) -> bool:
+    def repeats(self, visit: Visit, progress: Progress, answers: Mapping[str, Any]) -> bool:
         """Return whether these answers, of a form that names no step, repeat the answers to a step of the last minute.
 
         Simultaneous requests get the same result: `progress` has every answer before the due step, and answers never
         change. AWS calls: one read for each answer of that minute, at most `participant.MAX_COMPARED`.
         """
-        recent = progress.recently_answered(project, self._platform.now())
-        earlier = (self.read(project.id, user_id, key) for key in recent)
+        earlier = (self.read(visit, key) for key in progress.recently_answered(visit.project, visit.now))
         return any(participant.same_answers(answers, answer) for answer in earlier)

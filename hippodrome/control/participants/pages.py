@@ -50,7 +50,6 @@ class StepView:
     wrong: tuple[str, ...] = ()  # of a check: the fields that were not right
     tries_left: int = 0  # of a check; 0: as many as are needed
     end: str = ""  # of the page of an end: the end's name
-    files: str | None = None  # the address of the project's files; None: /steps/{projectId}/
 
 
 @dataclass(frozen=True)
@@ -66,8 +65,7 @@ class GameView:
     ticket: str
     sources: str  # the sources in the Content-Security-Policy to which the game may connect
     # the researcher's pages that the game page shows: by the key of `trial` that names a page, its text and its values
-    texts: Mapping[str, tuple[str, Mapping[str, Any]]] = field(default_factory=dict)
-    files: str | None = None  # the address of the project's files; None: /steps/{projectId}/
+    reading: Mapping[str, tuple[str, Mapping[str, Any]]] = field(default_factory=dict)
 
 
 # Pages
@@ -77,7 +75,7 @@ def step_page(view: StepView) -> Page:
     """Return a step page in its frame. Raises FragmentError."""
     nonce = secrets.token_urlsafe(16)
     texts = Texts(view.project.texts)
-    filled = _prepare(view.project, view.source, view.files).fill(view.values, nonce)
+    filled = _prepare(view.project, view.source).fill(view.values, nonce)
     content = Html(filled.html)
     is_asked = filled.has_fields
     if not view.final or (is_asked and not view.answered):
@@ -132,7 +130,7 @@ def fragment(view: StepView) -> str:
     named elements of its form (IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`).
     """
     wrong = _wrong(view, Texts(view.project.texts))
-    return _step_fields(view) + wrong + _prepare(view.project, view.source, view.files).render(view.values)
+    return _step_fields(view) + wrong + _prepare(view.project, view.source).render(view.values)
 
 
 def game_page(view: GameView) -> Page:
@@ -192,7 +190,7 @@ def game_page(view: GameView) -> Page:
         nonce,
         main=main,
         script=script("game/main.js", nonce, module=True, also=modules, texts=texts),
-        head=Html(refresh + (f"<style>\n{style_of_pages_in_game()}</style>\n" if view.texts else "")),
+        head=Html(refresh + (f"<style>\n{style_of_pages_in_game()}</style>\n" if view.reading else "")),
         sheets=("sessions.css",) * together + ("chat.css",) * ("chat.js" in modules),
         body="game",
     )
@@ -361,15 +359,15 @@ def _players(view: GameView) -> int:
     return int(view.state.get("players", view.project.players))
 
 
-def _prepare(project: Project, source: str, files: str | None) -> Fragment:
+def _prepare(project: Project, source: str) -> Fragment:
     hosts = tuple(allowed_sources(project.allowed_hosts))
-    return fragments.prepare(source, files or f"/steps/{project.id}/", hosts)
+    return fragments.prepare(source, f"/steps/{project.id}/", hosts)
 
 
 def _reading(view: GameView, nonce: str, texts: Texts) -> Html:
     """The researcher's pages that the game page shows. They come last, so no id in them hides one of the page's."""
     shown = [
-        fill("text", key=key, content=Html(_prepare(view.project, source, view.files).render(values, nonce)))
-        for key, (source, values) in view.texts.items()
+        fill("text", key=key, content=Html(_prepare(view.project, source).render(values, nonce)))
+        for key, (source, values) in view.reading.items()
     ]
     return fill("reading", texts, texts=Html("\n".join(shown))) if shown else Html()

@@ -20,8 +20,9 @@ from hippodrome.control.model import ids, participant
 from hippodrome.control.model.messages import StartServer, StopServer, to_message
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Server, requestable_attempt
-from hippodrome.control.participants import forms, previews
+from hippodrome.control.participants import forms, links
 from hippodrome.control.participants.forms import PostedForm
+from hippodrome.control.participants.visit import Visit
 from hippodrome.control.ports import Platform, Topic
 from hippodrome.control.storage.project_cache import ProjectCache
 from hippodrome.control.storage.repository import Repository
@@ -57,13 +58,13 @@ class Relays:
         """
         return self._respond(request, self._stop)
 
-    def _respond(self, request: Request, act: Callable[[Project, str, PostedForm], None]) -> Response:
+    def _respond(self, request: Request, act: Callable[[Visit, PostedForm], None]) -> Response:
         if request.method == "OPTIONS":
             return Response(204, "", http.CORS)
         try:
             form = _form(request)
             project, user_id = self._participant_of(request, form)
-            act(project, user_id, form)
+            act(Visit(request, project, user_id, self._platform.now()), form)
         except Refusal as refusal:
             return _answer(refusal.status, refusal.text)
         return _answer(200 if request.method == "GET" else 202, "Accepted.")
@@ -92,10 +93,9 @@ class Relays:
                 return project
         raise Refusal(403, f"{NO_PROOF} A token needs the projectId as well.")
 
-    def _start(self, project: Project, user_id: str, form: PostedForm) -> None:
-        owner = self._repository.session_id(project, user_id) or user_id
-        record = self._repository.server_of(project.id, owner)
-        self._authorize(project, user_id, form, record)
+    def _start(self, visit: Visit, form: PostedForm) -> None:
+        project, user_id = visit.project, visit.user_id
+        owner, record = self._server_of(visit, form)
         progress = self._repository.progress(project.id, user_id)
         own = self._repository.own_project(project, user_id, progress)
         is_due = progress.has_arrived and not progress.has_ended
@@ -111,11 +111,10 @@ class Relays:
             raise Refusal(409, "No further server can be started.")
         self._platform.bus.publish(Topic.START, to_message(StartServer(project.id, owner, attempt)))
 
-    def _stop(self, project: Project, user_id: str, form: PostedForm) -> None:
+    def _stop(self, visit: Visit, form: PostedForm) -> None:
         delay = _delay(form.answers)
-        owner = self._repository.session_id(project, user_id) or user_id
-        record = self._repository.server_of(project.id, owner)
-        self._authorize(project, user_id, form, record)
+        project, user_id = visit.project, visit.user_id
+        _, record = self._server_of(visit, form)
         if not project.has_sessions and (record is None or record.is_closed):
             raise Refusal(409, "There is no server to stop.")
         if record is None or record.is_closed or record.is_of_session:
@@ -124,22 +123,26 @@ class Relays:
         else:
             message, name = StopServer(project.id, user_id, record.attempt), record.name
         if delay:
-            at = self._platform.now() + timedelta(seconds=delay)
+            at = visit.now + timedelta(seconds=delay)
             self._platform.timers.set(ids.delayed_timer(name), at, to_message(message))
         else:
             self._platform.bus.publish(Topic.STOP, to_message(message))
 
-    def _authorize(self, project: Project, user_id: str, form: PostedForm, record: Server | None) -> None:
-        """Raise `Refusal` unless the form has the token of this server or a ticket of this participant."""
+    def _server_of(self, visit: Visit, form: PostedForm) -> tuple[str, Server | None]:
+        """The id of who has the server, the participant or their session; and its record.
+
+        Raises `Refusal` unless the form has the token of this server or a ticket of this participant.
+        """
+        owner = self._repository.session_id(visit.project, visit.user_id) or visit.user_id
+        record = self._repository.server_of(visit.project.id, owner)
         token = form.answers.get("token")
         expected = self._secrets.token(record) if record and isinstance(token, str) else ""
         if expected and record and record.is_of_session:
-            expected = member_token(expected, user_id)
-        if expected and ids.secrets_equal(str(token), expected):
-            return
-        if project.step_of_ticket(user_id, form.step, form.ticket):
-            return
-        raise Refusal(403, NO_PROOF)
+            expected = member_token(expected, visit.user_id)
+        has_token = bool(expected) and ids.secrets_equal(str(token), expected)
+        if not has_token and not visit.step_of_ticket(form.step, form.ticket):
+            raise Refusal(403, NO_PROOF)
+        return owner, record
 
 
 def _form(request: Request) -> PostedForm:
@@ -148,7 +151,7 @@ def _form(request: Request) -> PostedForm:
         return forms.read(request) if request.body else PostedForm({})
     if request.method != "GET":
         raise Refusal(405, "Use POST, or GET with a query.")
-    if previews.preview_kind(request) is not None:
+    if links.preview_kind(request) is not None:
         raise Refusal(403, "Nothing was started or stopped: this is the preview of a link, not a participant.")
     if request.query is None:
         raise Refusal(400, "The query cannot be read.")

@@ -6,7 +6,6 @@ from datetime import datetime
 from typing import Any
 
 from hippodrome.control.model.design import Step
-from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import (
     Reason,
     Server,
@@ -15,7 +14,8 @@ from hippodrome.control.model.server import (
     next_attempt,
     requestable_attempt,
 )
-from hippodrome.control.ports import Dns, Settings
+from hippodrome.control.participants.visit import Visit
+from hippodrome.control.ports import Platform
 from hippodrome.control.storage.secret import SecretCache
 
 MAX_START_TIMES = 50  # so many of the latest starts count for `typical`
@@ -25,21 +25,18 @@ FAILURES = (Reason.LOST, Reason.REFUSED, Reason.NO_CAPACITY, Reason.FULL)
 class ServerStates:
     """Makes the states of servers (docs/pages.md), and remembers how long their latest starts took."""
 
-    def __init__(self, settings: Settings, secrets: SecretCache) -> None:
-        self._settings = settings
+    def __init__(self, platform: Platform, secrets: SecretCache) -> None:
+        self._platform = platform
         self._secrets = secrets
         self._start_times: list[float] = []  # seconds from request to ready
 
     def state(
         self,
-        project: Project,
-        user_id: str,
+        visit: Visit,
         step: Step | None,
         record: Server | None,
-        *,
-        dns: Dns,
-        now: datetime,
         since: datetime | None = None,
+        *,
         asked: int | None = None,
     ) -> dict[str, Any]:
         """Return the state of the participant's server as JSON data for the game page (docs/pages.md).
@@ -55,8 +52,8 @@ class ServerStates:
             "without": False,
             "reason": None,
             "replaces": False,
-            "userId": user_id,
-            "step": step.key if step else next(iter(project.game_steps), None),
+            "userId": visit.user_id,
+            "step": step.key if step else next(iter(visit.project.game_steps), None),
         }
         if record is not None and record.is_closed and asked is not None and record.attempt < asked:
             state["attempt"] = asked
@@ -67,11 +64,11 @@ class ServerStates:
                 state.update(_closed(record))
             elif step is not None and step.type.on_server and record.lacks(step.key):
                 state["state"] = ServerState.QUEUED  # `GameStep` has this server stopped, and another will start
-            elif record.state is ServerState.READY and (host := record.browser_host(dns)):
+            elif record.state is ServerState.READY and (host := record.browser_host(self._platform.dns)):
                 self._remember(record)
-                state["url"] = self._settings.game_address(host, record.port)
+                state["url"] = self._platform.settings.game_address(host, record.port)
                 state["token"] = self._secrets.token(record)
-        state["seconds"] = max(0, round((now - since).total_seconds())) if since else 0
+        state["seconds"] = max(0, round((visit.now - since).total_seconds())) if since else 0
         state["typical"] = round(sorted(self._start_times)[len(self._start_times) // 2]) if self._start_times else None
         return state
 

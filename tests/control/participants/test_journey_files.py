@@ -13,7 +13,7 @@ import pytest
 from hippodrome.control.model.project import MASTER_LIST, Events, MasterList
 from hippodrome.control.model.records import to_json
 from hippodrome.control.participants.files import MAX_BYTES
-from hippodrome.control.participants.link_fields import OUR_FIELDS, RECRUITER_IDS
+from hippodrome.control.participants.links import OUR_FIELDS, RECRUITER_IDS
 from hippodrome.functions import next_step
 from testing.aws_events import http_event
 from testing.fake_platform import FakePlatform

@@ -283,10 +283,9 @@ def test_pages_without_expressions_do_not_import_jinja() -> None:
     assert out.stdout.split() == ["False", "False"]
 
 
-@pytest.mark.parametrize(("files", "folder"), [(None, "/steps/demo/"), ("steps/demo/", "steps/demo/")])
-def test_pictures_come_from_the_folder_of_the_projects_files(files: str | None, folder: str) -> None:
+def test_pictures_come_from_the_folder_of_the_projects_files() -> None:
     source = "<img src=a.png>"
-    view = dataclasses.replace(step_view(source), files=files)
+    view = step_view(source)
     reading = GameView(
         PROJECT,
         STEPS[2],
@@ -296,11 +295,10 @@ def test_pictures_come_from_the_folder_of_the_projects_files(files: str | None, 
         "/next",
         "TICKET",
         "",
-        texts={"instructions": (source, {})},
-        files=files,
+        reading={"instructions": (source, {})},
     )
     for html in (pages.step_page(view).html, pages.fragment(view), pages.game_page(reading).html):
-        assert Elements(html).named("img") == [{"src": f"{folder}a.png"}]
+        assert Elements(html).named("img") == [{"src": "/steps/demo/a.png"}]
 
 
 # The game page

@@ -15,6 +15,7 @@ from hippodrome.control.ports import Address
 from hippodrome.control.storage.secret import SecretCache
 from testing.fake_platform import FakePlatform
 from testing.studies import study
+from testing.visitors import visit_of
 
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
 PLATFORM = FakePlatform()
@@ -32,11 +33,8 @@ def running(seconds: float) -> Server:
 
 
 def state_of(record: Server | None, waiting: ServerStates | None = None, **changes: Any) -> dict[str, Any]:
-    project = study()
-    asked: dict[str, Any] = {"dns": PLATFORM.dns, "now": NOW + timedelta(seconds=7.4), **changes}
-    return (waiting or ServerStates(PLATFORM.settings, SECRETS)).state(
-        project, "alice", project.steps[2], record, **asked
-    )
+    visit = visit_of(study(), NOW + timedelta(seconds=7.4))
+    return (waiting or ServerStates(PLATFORM, SECRETS)).state(visit, visit.project.steps[2], record, **changes)
 
 
 def test_before_there_is_a_server_the_state_is_queued_since_the_participant_came() -> None:
@@ -57,10 +55,10 @@ def test_before_there_is_a_server_the_state_is_queued_since_the_participant_came
 
 
 def test_a_participant_who_is_not_at_a_game_step_gets_the_first_game_step() -> None:
-    waiting, project = ServerStates(PLATFORM.settings, SECRETS), study()
-    assert waiting.state(project, "alice", None, None, dns=PLATFORM.dns, now=NOW)["step"] == "3"
+    waiting, project = ServerStates(PLATFORM, SECRETS), study()
+    assert waiting.state(visit_of(project), None, None)["step"] == "3"
     no_game = study(steps=[project.steps[0], project.steps[-1]])
-    assert waiting.state(no_game, "alice", None, None, dns=PLATFORM.dns, now=NOW)["step"] is None
+    assert waiting.state(visit_of(no_game), None, None)["step"] is None
 
 
 def test_the_wait_for_a_server_counts_from_its_request() -> None:
@@ -84,7 +82,7 @@ def test_only_a_ready_server_gives_its_address_and_token() -> None:
 
 
 def test_the_typical_wait_is_the_median_of_the_last_fifty_starts() -> None:
-    waiting = ServerStates(PLATFORM.settings, SECRETS)
+    waiting = ServerStates(PLATFORM, SECRETS)
     assert state_of(running(10), waiting)["typical"] == 10
     for seconds in (30, 20.4, 60, 70):
         state_of(running(seconds), waiting)

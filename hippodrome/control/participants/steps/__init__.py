@@ -7,23 +7,23 @@ from typing import Protocol
 
 from hippodrome.control.http import Response
 from hippodrome.control.model.design import Step
-from hippodrome.control.model.project import Project
 from hippodrome.control.participants.forms import PostedForm
+from hippodrome.control.participants.path import Stop
+from hippodrome.control.participants.services import Services
 from hippodrome.control.participants.steps.game import GameStep
 from hippodrome.control.participants.steps.page import PageStep
-from hippodrome.control.participants.steps.services import StepServices
-from hippodrome.control.participants.steps.visit import Visit
+from hippodrome.control.participants.visit import Visit
 
 
 class StepHandler(Protocol):
     """Handles the requests at steps of one type."""
 
-    def show(self, visit: Visit) -> Response:
+    def show(self, stop: Stop) -> Response:
         """Return the response to a GET. Raises `PageError` if the step cannot be shown."""
 
-    def post(self, project: Project, user_id: str, step: Step, form: PostedForm) -> None:
+    def post(self, visit: Visit, step: Step, form: PostedForm) -> None:
         """Handle a form that the participant may send at this step."""
 
 
-HANDLERS: Mapping[str, Callable[[StepServices], StepHandler]] = {"page": PageStep, "game": GameStep}
+HANDLERS: Mapping[str, Callable[[Services], StepHandler]] = {"page": PageStep, "game": GameStep}
 """The handler of each type of step, by the type's name."""

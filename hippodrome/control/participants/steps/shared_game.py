@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -16,16 +17,13 @@ from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Server, ServerState
 from hippodrome.control.participants.pages import LOBBY
-from hippodrome.control.participants.steps.services import StepServices
+from hippodrome.control.participants.services import Services
+from hippodrome.control.participants.visit import Visit
 from hippodrome.protocol.session import member_token
 
 ENDED = "ended"
 UNMATCHED = "unmatched"
 """A state that no server has, like `LOBBY` (docs/pages.md)."""
-
-
-class StepAnswered(Exception):
-    """This request has answered the step, so the next step is due."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,53 +57,50 @@ class Standing:
 class SharedGame:
     """Leads participants at a game step of several players to the lobby, and then to their session."""
 
-    def __init__(self, services: StepServices) -> None:
-        self._services = services
+    def __init__(self, services: Services) -> None:
+        self._repository = services.repository
+        self._answers = services.answers
+        self._states = services.states
         self._lobby = Lobby(services.platform, services.repository)
 
-    def visit(self, project: Project, user_id: str, step: Step) -> Standing:
+    def visit(self, visit: Visit, step: Step) -> Standing:
         """Handle a request at this step, and return where the participant stands.
 
         A participant without a membership waits in the lobby. Before the step at which servers start, and from the step
         at which they stop, there is no lobby: then only a membership is looked up.
         """
+        project, user_id = visit.project, visit.user_id
         if not participant.may_have_server(project, step):
-            return self.decided(project, user_id) or Standing(None)
-
-        def answers() -> Mapping[str, Any]:
-            return self._earlier_answers(project, user_id, step)
-
+            return self.decided(visit) or Standing(None)
+        answers = partial(self._earlier_answers, visit, step)
         return self._standing(project, self._lobby.visit(project, user_id, project.group(user_id), answers))
 
-    def decided(self, project: Project, user_id: str) -> Standing | None:
+    def decided(self, visit: Visit) -> Standing | None:
         """Return where the participant stands if they are in a session or unmatched; else None. Writes nothing."""
-        membership = self._services.repository.membership(project.id, user_id)
-        return self._standing(project, membership) if membership else None
+        membership = self._repository.membership(visit.project.id, visit.user_id)
+        return self._standing(visit.project, membership) if membership else None
 
-    def state_alone(
-        self, project: Project, user_id: str, step: Step | None, *, is_member: bool = False
-    ) -> dict[str, Any] | None:
+    def state_alone(self, visit: Visit, step: Step | None, *, is_member: bool = False) -> dict[str, Any] | None:
         """Return the state for a page that was made when one player was registered; None if that was never so.
 
         If the participant has no server of their own, the state is `ended`: the page is loaded again, and is then the
         page of the lobby or of the participant's session. AWS calls: one read.
         """
-        before = project.for_session(1)
+        before = visit.project.for_session(1)
         if before is None:
             return None
-        record = None if is_member else self._services.repository.server_of(project.id, user_id)
-        state = self._services.state(before, user_id, step, record)
+        record = None if is_member else self._repository.server_of(before.id, visit.user_id)
+        state = self._states.state(visit.on(before), step, record)
         return state if record else state | {"state": ENDED}
 
-    def leave(self, project: Project, user_id: str) -> None:
+    def leave(self, visit: Visit) -> None:
         """Note that the participant has closed the lobby's page, unless they are matched already."""
-        if self._services.repository.membership(project.id, user_id) is None:
-            self._lobby.leave(project, user_id)
+        if self._repository.membership(visit.project.id, visit.user_id) is None:
+            self._lobby.leave(visit.project, visit.user_id)
 
     def state(
         self,
-        project: Project,
-        user_id: str,
+        visit: Visit,
         step: Step | None,
         standing: Standing,
         since: datetime | None = None,
@@ -116,7 +111,8 @@ class SharedGame:
 
         A member's page gets the member's own token, never the server's.
         """
-        state = self._services.state(project, user_id, step, standing.record, since, asked=asked)
+        project = visit.project
+        state = self._states.state(visit, step, standing.record, since, asked=asked)
         found = standing.found
         if isinstance(found, LobbyState):
             return state | {
@@ -129,7 +125,7 @@ class SharedGame:
                 "proposed": found.proposed,
             }
         if "token" in state:
-            state["token"] = member_token(state["token"], user_id)
+            state["token"] = member_token(state["token"], visit.user_id)
         if found is None:
             return state
         if standing.is_unmatched:
@@ -140,16 +136,16 @@ class SharedGame:
         if isinstance(lobby_state, NoServerYet):
             return Standing(lobby_state, _not_yet_ready(lobby_state.record))
         session = lobby_state.session if isinstance(lobby_state, Membership) else None
-        return Standing(lobby_state, self._services.repository.server_of(project.id, session) if session else None)
+        return Standing(lobby_state, self._repository.server_of(project.id, session) if session else None)
 
-    def _earlier_answers(self, project: Project, user_id: str, step: Step) -> Mapping[str, Any]:
+    def _earlier_answers(self, visit: Visit, step: Step) -> Mapping[str, Any]:
         """The participant's answers on the pages before this step. Of a field on two pages, the later answer counts."""
-        at = project.index(step.key) or 0
-        pages = [step for step in project.steps[:at] if not step.type.on_server]
-        earlier_answers: dict[str, Any] = {}
-        for page in pages:
-            earlier_answers |= self._services.answers.read(project.id, user_id, page.key)
-        return earlier_answers
+        before = visit.project.steps[: visit.project.index(step.key) or 0]
+        answers: dict[str, Any] = {}
+        for page in before:
+            if not page.type.on_server:
+                answers |= self._answers.read(visit, page.key)
+        return answers
 
 
 def _not_yet_ready(record: Server | None) -> Server | None:
