@@ -1,5 +1,7 @@
 // Step pages work without this script. With it they keep a draft of the answers, say what is happening when the
-// connection is bad, show the number that a slider stands at, send no slider that nobody has moved, and copy a completion code.
+// connection is bad, and copy a completion code.
+import { addSlider, isUnset, removeUnset, setSlider } from "./game/sliders.js";
+
 (() => {
   "use strict";
 
@@ -15,9 +17,6 @@
   const form = document.querySelector("form.page");
   const prefix = "hippodrome:";
   const key = prefix + [page.project, page.user, page.step].join(":");
-
-  // A slider without a starting value is unset until it is moved or tapped: the middle, where it stands, is nobody's answer.
-  const unset = new Map(inForm("input[type=range]:not([value])").map((slider) => [slider, slider.value]));
 
   // The draft
 
@@ -40,7 +39,7 @@
   }
 
   function fields() {
-    return inForm(":is(input, select, textarea)").filter((field) => field.name && !UNKEPT.has(field.type) && !unset.has(field));
+    return inForm(":is(input, select, textarea)").filter((field) => field.name && !UNKEPT.has(field.type));
   }
 
   function valueOf(field) {
@@ -53,6 +52,7 @@
     if (field.type === "checkbox" || field.type === "radio") field.checked = value === true;
     else if (field.type === "select-multiple") [...field.options].forEach((o, i) => { o.selected = value[i] === true; });
     else field.value = value;
+    if (field.type === "range") setSlider(field);
   }
 
   // A draft finds its fields by name and, for checkboxes and radio buttons, by value: if the page was changed meanwhile, only
@@ -63,7 +63,7 @@
   }
 
   function keepDraft() {
-    const draft = { at: Date.now(), values: fields().map((field) => [nameOf(field), valueOf(field)]) };
+    const draft = { at: Date.now(), values: fields().filter((field) => !isUnset(field)).map((field) => [nameOf(field), valueOf(field)]) };
     withStorage((storage) => storage.setItem(key, JSON.stringify(draft)));
   }
 
@@ -72,11 +72,9 @@
     if (!draft || !Array.isArray(draft.values)) return;
     const values = new Map();
     for (const [name, value] of draft.values) values.set(name, [...(values.get(name) ?? []), value]);
-    for (const field of [...fields(), ...unset.keys()]) {
+    for (const field of fields()) {
       const kept = values.get(nameOf(field));
-      if (!kept?.length) continue;
-      setValue(field, kept.shift());
-      unset.delete(field);
+      if (kept?.length) setValue(field, kept.shift());
     }
   }
 
@@ -211,7 +209,7 @@
   }
 
   function isEmpty(field) {
-    return field.validity.valueMissing || unset.has(field);
+    return field.validity.valueMissing || isUnset(field);
   }
 
   function noteAt(field) {
@@ -244,39 +242,6 @@
     if (less) sayMissing();
   }
 
-  // Sliders
-
-  function showNumber(slider) {
-    if (slider.closest(".range") || document.querySelector(`output[for="${CSS.escape(slider.id)}"]`)) return;
-    const box = document.createElement("span");
-    const output = document.createElement("output");
-    box.className = "range";
-    if (slider.id) output.htmlFor = slider.id;
-    slider.replaceWith(box);
-    box.append(slider, output);
-    const show = () => { output.textContent = unset.has(slider) ? "–" : slider.value; };
-    slider.addEventListener("input", show);
-    slider.addEventListener("click", show);
-    show();
-  }
-
-  function markUnset(slider) {
-    slider.classList.add("unset");
-    if (slider.required) slider.setCustomValidity(TEXT.answerHere);
-    const set = () => {
-      unset.delete(slider);
-      slider.classList.remove("unset");
-      slider.setCustomValidity("");
-      onInput();
-    };
-    for (const type of ["input", "click"]) slider.addEventListener(type, set, { once: true });
-  }
-
-  // A slider that a script of the page has moved is sent.
-  function withoutUnset({ formData }) {
-    for (const [slider, middle] of unset) if (slider.value === middle) formData.delete(slider.name);
-  }
-
   // Completion codes
 
   function addCopy(code) {
@@ -302,10 +267,9 @@
   clearDrafts();
   document.querySelectorAll(".code").forEach(addCopy);
   if (!form) return;
+  inForm("input[type=range]").forEach(addSlider);
   restoreDraft();
-  [...unset.keys()].forEach(markUnset);
-  inForm("input[type=range]").forEach(showNumber);
-  listen("formdata", withoutUnset);
+  listen("formdata", ({ formData }) => removeUnset(formData));
   listen("input", onInput);
   listen("change", onInput);
   listen("submit", onSubmit);

@@ -129,6 +129,24 @@ def world_with_pages(world: World) -> World:
     return world
 
 
+def test_a_slider_of_instructions_shows_its_number_and_is_no_answer_until_it_is_moved(
+    world_with_pages: World, tab: Any
+) -> None:
+    sliders = "".join(
+        f"<label for={name}>{name}</label><input type=range id={name} name={name} {more}>"
+        for name, more in (("trust", "required"), ("fun", ""), ("set", "value=7"))
+    )
+    world_with_pages.texts["instructions"] = f"<h1>The rules</h1>{sliders}"
+    tab.goto(world_with_pages.url)
+    tab.click("text=Go to the game")
+    assert tab.is_visible("#trust"), "it is required"
+    tab.click("#trust")
+    assert tab.locator("#reading output").all_inner_texts() == ["50", "\N{EN DASH}", "7"]
+    shot(tab, "360-instructions-sliders")
+    tab.click("text=Go to the game")
+    world_with_pages.wait_for({"form": {"page": "instructions", "fields": {"trust": "50", "set": "7"}}})
+
+
 @SIZES
 def test_the_game_does_not_begin_while_the_instructions_are_shown(
     world_with_pages: World, tab: Any, width: int, height: int

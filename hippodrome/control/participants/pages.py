@@ -96,7 +96,7 @@ def step_page(view: StepView) -> Page:
         view.user_id,
         nonce,
         main=main,
-        script=script("step.js", nonce, texts=texts),
+        script=script("step.js", nonce, module=True, texts=texts),
         title=filled.title,
         lang=filled.lang,
         heading=not filled.has_heading,
@@ -116,7 +116,7 @@ def end_page(project: Project, user_id: str, end: str, code: str, link: str) -> 
         user_id,
         nonce,
         main=fill("message", title=title, text=text, more=end_code(texts, code, link)),
-        script=script("step.js", nonce, texts=texts),
+        script=script("step.js", nonce, module=True, texts=texts),
         title=title,
         data=fill("end", end=end),
     )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-_IMPORT = re.compile(r'^import \{\s*\w+(?:,\s*\w+)*,?\s*\} from "\./([\w-]+\.js)";\n', re.MULTILINE)
+_IMPORT = re.compile(r'^import \{\s*\w+(?:,\s*\w+)*,?\s*\} from "\./([\w/-]+\.js)";\n', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=async |const |function |let )", re.MULTILINE)
 _LEFT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
 
@@ -34,8 +34,8 @@ def _add(module: Path, modules: dict[Path, str], above: tuple[Path, ...] = ()) -
         raise ValueError(f"{module.name} imports itself, by way of {above[-1].name}")
     source = module.read_text(encoding="utf-8")
     for name in _IMPORT.findall(source):
-        if module.with_name(name) not in modules:
-            _add(module.with_name(name), modules, (*above, module))
+        if module.parent / name not in modules:
+            _add(module.parent / name, modules, (*above, module))
     script = _EXPORT.sub("", _IMPORT.sub("", source))
     if match := _LEFT.search(script):
         raise ValueError(f"{module.name} cannot be joined: {match[0]}")

@@ -4,6 +4,7 @@ import { send } from "./connection.js";
 import { hooks } from "./hooks.js";
 import { overlays } from "./overlay.js";
 import { data, find, make, points, setText, showSection } from "./page.js";
+import { addSlider, removeUnset, resetSlider } from "./sliders.js";
 import { game } from "./state.js";
 import { recall, remember } from "./storage.js";
 
@@ -12,6 +13,7 @@ const LAST_PICTURE = 2_500; // ms for which the last picture and the score are s
 const texts = { instructions: find("text-instructions"), between: find("text-betweenEpisodes") };
 const noted = `read-${data.step}`;
 const trouble = make("p", { className: "problem", role: "status", hidden: true });
+const sliders = [...find("reading").querySelectorAll("input[type=range]")];
 const again = make("button", { type: "button", id: "instructions-button", textContent: TEXT.instructions, hidden: true });
 
 let reading = ""; // the name of the text that is shown
@@ -31,7 +33,10 @@ function openText(name, goOn, score = "") {
 }
 
 function closeText() {
-  if (reading === "between") texts.between.reset();
+  if (reading === "between") {
+    texts.between.reset();
+    sliders.filter((slider) => slider.form === texts.between).forEach(resetSlider);
+  }
   reading = "";
   showSection("play");
   find("screen").focus({ preventScroll: true });
@@ -45,7 +50,9 @@ function openBetween() {
 function sendFields(form, page) {
   if (!form.reportValidity()) return false;
   const fields = {};
-  for (const [name, value] of new FormData(form)) {
+  const formData = new FormData(form);
+  removeUnset(formData);
+  for (const [name, value] of formData) {
     if (typeof value !== "string") continue; // a file
     fields[name] = name in fields ? [fields[name], value].flat() : value;
   }
@@ -72,6 +79,7 @@ hooks.overlay.push((name) => {
   else if (reading && name !== "lost") closeText();
 });
 
+sliders.forEach(addSlider);
 if (texts.between) overlays.break.button = TEXT.continue;
 find("overlay").append(again);
 find("reading").append(trouble);
