@@ -19,9 +19,9 @@ from hippodrome.console import screen
 from hippodrome.console.formatting import count
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.model.project import Project
-from hippodrome.deployment.aws.account import Account, Installation, find_installation, open_account
+from hippodrome.deployment.aws.account import Account, find_installation, open_account
 from hippodrome.deployment.aws.resource_names import STACK
-from hippodrome.deployment.core import explain, options, participants
+from hippodrome.deployment.core import options, participants
 from hippodrome.deployment.core.finding import Finding, Mark, bad, examine, good, look, show
 from hippodrome.deployment.core.study_selection import one_or_all
 from hippodrome.deployment.cost.prices import REGION
@@ -33,7 +33,37 @@ from hippodrome.deployment.stack.stack import Stack
 WITHIN = 20  # minutes that a rehearsal with bots may take, without --within; about ten are usual
 MAX_BOTS = 20
 
+
+def stack_state(context: CheckContext) -> Iterator[Finding]:
+    """Check whether the stack is complete."""
+    name, status = context.installation.stack, context.installation.status
+    if status in states.COMPLETE:
+        yield good("stack", f"{name} is in {status}.")
+    elif status == "UPDATE_ROLLBACK_COMPLETE":
+        text = f"{name} works as before its last update, which failed."
+        yield look("stack", text, "`hippodrome plan` says whether something is still to be changed.")
+    else:
+        yield look("stack", f"{name} is in {status}.", "`hippodrome apply` finishes or repairs what was begun.")
+
+
+def version(context: CheckContext) -> Iterator[Finding]:
+    """Check whether the stack's template is that of this version, apart from the functions' code."""
+    from hippodrome.deployment.code.template import Template  # noqa: PLC0415 - YAML, which only this check needs
+
+    present = Stack(context.account, context.installation.stack).template()
+    if present and _plain(present) != _plain(Template.read().for_region(context.account.region).text):
+        text = "The stack was made by another version of this command."
+        yield look("version", text, "`hippodrome plan` shows what differs.")
+
+
+def _plain(template: str) -> str:
+    """Return the template without the hashes of the functions' code."""
+    return re.sub(r"(S3Key:\s*[\"']?[A-Za-z0-9_]+?)(-[0-9a-f]{8,64})?\.zip", r"\1.zip", template).strip()
+
+
 CHECKS: dict[str, Check] = {
+    "stack": stack_state,
+    "version": version,
     "hosted zone": addresses.zone,
     "site certificate": addresses.site_certificate,
     "site": addresses.site,
@@ -101,20 +131,25 @@ def command(
     project = one_or_all(study, every)
     account = open_account(profile, region)
     findings = [*credentials(account)]
-    installation, diagnoses = installation_state(account, stack)
-    findings += diagnoses
-    rehearsed: list[Finding] = []
-    document: dict[str, Any] = {}
-    if installation is not None:
+    context: CheckContext | None = None
+    try:
+        installation = find_installation(account, stack)
+    except Problem as problem:
+        findings.append(bad("stack", str(problem), problem.advice))
+    else:
         context = CheckContext(account, installation, at_once, datetime.now(UTC), fetch=addresses.fetch)
         if only_aws:
             context.delegation = context.fetch = None
-        context.wanted = _wanted(context, project)
+        if project:
+            registered = participants.registered_projects(context.platform.documents, [])
+            (context.wanted,) = participants.choose(registered, project)
         with screen.err.status("Looking …"):
             findings += examine(context, CHECKS)
+    rehearsed: list[Finding] = []
+    document: dict[str, Any] = {}
     if not as_json:
         show(findings, screen.out)
-    if installation is not None and rehearse:
+    if context is not None and rehearse:
         try:
             document = _rehearse(context, rehearsed, play, within, transcript, yes=yes)
         except KeyboardInterrupt:
@@ -137,73 +172,11 @@ def credentials(account: Account) -> Iterator[Finding]:
     identity = account.identity
     name = identity["Arn"].rpartition(":")[2]
     if name == "root":
-        yield look(
-            "credentials",
-            f"The root user of account {account.id}.",
-            "Use a role or another user: root may do everything.",
-        )
+        text = f"The root user of account {account.id}."
+        yield look("credentials", text, "Use a role or another user: root may do everything.")
     else:
         yield good("credentials", f"{name} in account {account.id}.")
     yield good("region", f"{account.region}.")
-
-
-def installation_state(account: Account, stack: str) -> tuple[Installation | None, list[Finding]]:
-    """Find the installation (None if there is none), and check its state and version."""
-    try:
-        installation = find_installation(account, stack)
-    except Problem as problem:
-        return None, [bad("stack", str(problem), problem.advice)]
-    diagnoses = []
-    if installation.status in states.COMPLETE:
-        diagnoses.append(good("stack", f"{stack} is in {installation.status}."))
-    elif installation.status == "UPDATE_ROLLBACK_COMPLETE":
-        diagnoses.append(
-            look(
-                "stack",
-                f"{stack} works as before its last update, which failed.",
-                "`hippodrome plan` says whether something is still to be changed.",
-            )
-        )
-    else:
-        diagnoses.append(
-            look(
-                "stack",
-                f"{stack} is in {installation.status}.",
-                "`hippodrome apply` finishes or repairs what was begun.",
-            )
-        )
-    try:
-        diagnoses += _version(account, stack)
-    except Exception as error:  # noqa: BLE001 - it becomes a finding, and the other checks go on
-        why = explain.problem_from(error) or Problem(f"{type(error).__name__}.")
-        diagnoses.append(look("version", f"could not be checked: {why}", why.advice))
-    return installation, diagnoses
-
-
-def _version(account: Account, stack: str) -> Iterator[Finding]:
-    """Check whether the stack's template is that of this version, apart from the functions' code."""
-    from hippodrome.deployment.code.template import Template  # noqa: PLC0415 - YAML, which only this check needs
-
-    present = Stack(account, stack).template()
-    if present and _plain(present) != _plain(Template.read().for_region(account.region).text):
-        yield look(
-            "version",
-            "The stack was made by another version of this command.",
-            "`hippodrome plan` shows what differs.",
-        )
-
-
-def _plain(template: str) -> str:
-    """Return the template without the hashes of the functions' code."""
-    return re.sub(r"(S3Key:\s*[\"']?[A-Za-z0-9_]+?)(-[0-9a-f]{8,64})?\.zip", r"\1.zip", template).strip()
-
-
-def _wanted(context: CheckContext, project_id: str | None) -> Project | None:
-    """Find the registered project with this id; None: all are wanted. Raises `Problem` if it is not registered."""
-    if project_id is None:
-        return None
-    (project,) = participants.choose(participants.registered_projects(context.platform.documents, []), project_id)
-    return project
 
 
 def _rehearse(

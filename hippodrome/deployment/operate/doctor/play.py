@@ -98,7 +98,6 @@ class Play:
         bots += -(bots + 1) % project.players  # bots and victim together fill whole sessions
         self._names = [*map(str, range(1, bots + 1)), "victim"]
         self.bots: list[Bot] = []  # the last is the victim, whose task is killed
-        self._lone: LoneServer | None = None  # the server that its timer ends
         self._struck = False
         self._not_struck = "its game never began"
         installation = context.installation
@@ -110,7 +109,8 @@ class Play:
         part("erased", self._remove_old_copies)
         try:
             if part("study", self._make):
-                begun = part("timer", self._start_lone_server)
+                lone = LoneServer(self._platform, self._copy.project, self._progress)
+                begun = part("timer", lone.start)
                 part("site", self._site)
                 part("links", self._links)
                 part("pages", self._walk)
@@ -120,8 +120,8 @@ class Play:
                 part("end", self._end)
                 part("data", self._data)
                 if begun:
-                    part("timer", self._timer)
-                part("sweep", self._sweep)
+                    part("timer", lambda: self._timer(lone))
+                part("sweep", lambda: self._sweep(lone.record))
                 part("alarm", self._alarm)
         finally:
             part("cost", self._cost)
@@ -153,8 +153,7 @@ class Play:
         return f"The copy and the bots' data are gone, {deleted} versions of documents in all."
 
     def _cost(self) -> str:
-        lone = self._lone.read() if self._lone else None
-        total = spent([*self._records(), *([lone] if lone else [])], datetime.now(UTC))
+        total = spent(self._copy.records(), datetime.now(UTC))
         text = (
             f"About ${total.usd.likely:.4f} for {total.attempts} servers with {total.hours * 60:.0f} minutes together"
         )
@@ -373,18 +372,12 @@ class Play:
 
     # Without bots
 
-    def _start_lone_server(self) -> None:
-        self._lone = LoneServer(self._platform, self._copy.project, self._progress)
-        self._lone.start()
-
-    def _timer(self) -> str:
+    def _timer(self, lone: LoneServer) -> str:
         """A server that nobody stops is ended by its timer.
 
         The rehearsal does not wait for the project's `maxRuntime`. It checks that the ready server has a timer at its
         deadline, and moves the timer to the next minute, with the same name, role, topic and message.
         """
-        lone = self._lone
-        assert lone is not None, "it was started"
         record = lone.until_ready()
         if self._set_for(record) != record.deadline.astimezone(UTC).replace(microsecond=0):
             text = "It has no timer at its deadline."
@@ -415,9 +408,8 @@ class Play:
             return None
         return datetime.strptime(expression, "at(%Y-%m-%dT%H:%M:%S)").replace(tzinfo=UTC)
 
-    def _sweep(self) -> str:
+    def _sweep(self, closed: Server | None) -> str:
         """The sweep removes the timer of a closed server, and its name. Without a domain servers have no names."""
-        closed = self._lone.record if self._lone else None
         if closed is None or not closed.is_closed:
             raise CheckFailed("There is no closed server to leave something behind.", "See the line `timer`.")
         stop = StopServer(closed.project_id, closed.user_id, closed.attempt, Reason.DEADLINE)

@@ -115,24 +115,19 @@ class LoneServer:
 
     def _late(self, record: Server | None) -> CheckFailed:
         """Explain why the server may be late, by its state and by whether ECS knows its task."""
-        if record is not None and record.state is ServerState.STARTING:
-            if self._platform.tasks.find(record.name, record.cluster):
-                return CheckFailed(
-                    f"Its task was started {WAIT:.0f} seconds ago, and no event of it has arrived.",
-                    "See the task in the ECS console; if it runs, its event is missing: "
-                    "`hippodrome logs --all --function task_changed`.",
-                )
+        logs = "See `hippodrome logs --all --function"
+        if record is None or record.state not in {ServerState.STARTING, ServerState.NAMING}:
+            return CheckFailed(f"Not ready after {WAIT:.0f} seconds.", "See `hippodrome logs --all --errors`.")
+        if record.state is ServerState.NAMING:
+            text = f"It runs, and its name is not known everywhere, or it has no certificate, after {WAIT:.0f} seconds."
+            return CheckFailed(text, f"{logs} task_changed`, or `… certify_server` without a domain.")
+        if self._platform.tasks.find(record.name, record.cluster):
+            text = f"Its task was started {WAIT:.0f} seconds ago, and no event of it has arrived."
             return CheckFailed(
-                f"There is no task after {WAIT:.0f} seconds.",
-                "It was not run, or it ended at once: see `hippodrome logs --all --function start_server` and "
-                "`… --function trial`.",
+                text, f"If the ECS console says that it runs, its event is missing. {logs} task_changed`."
             )
-        if record is not None and record.state is ServerState.NAMING:
-            return CheckFailed(
-                f"It runs, and its name is not known everywhere, or it has no certificate, after {WAIT:.0f} seconds.",
-                "See `hippodrome logs --all --function task_changed`, or `… certify_server` without a domain.",
-            )
-        return CheckFailed(f"Not ready after {WAIT:.0f} seconds.", "See `hippodrome logs --all --errors`.")
+        text = f"There is no task after {WAIT:.0f} seconds: it was not run, or it ended at once."
+        return CheckFailed(text, f"{logs} start_server` and `… --function trial`.")
 
     def visit(self, record: Server, reach: Reach) -> Finding:
         """Connect to the server as a browser does, which proves its name, the port, TLS and the certificate."""

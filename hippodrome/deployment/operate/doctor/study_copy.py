@@ -20,6 +20,7 @@ from hippodrome.control.lobby import decisions, entries
 from hippodrome.control.model import server
 from hippodrome.control.model.balance import cells_key
 from hippodrome.control.model.project import MASTER_LIST, STEPS_FOLDER, MasterList, Project, read_list, write_list
+from hippodrome.control.model.server import Server
 from hippodrome.control.ports import Conflict, Documents
 from hippodrome.control.storage.project_cache import FRESH
 from hippodrome.deployment.aws.versions import VersionedBucket
@@ -74,6 +75,11 @@ class StudyCopy:
         (signature,) = links.signed(self._context.account, installation, self.id, [user_id]).values()
         return links.link(installation["Site"], self.project, user_id, signature)
 
+    def records(self) -> list[Server]:
+        """Read the records of all servers of the copy."""
+        recent = Records(self._documents).since(_made_at(self._documents, self.id))
+        return [record for record in recent if record.project_id == self.id]
+
     def remove(self, progress: Callable[[str], None] = lambda _: None) -> int:
         """Remove the registration, the servers, and all documents. Return how many versions of documents were deleted.
 
@@ -89,10 +95,8 @@ class StudyCopy:
             raise Problem("A server of the copy still runs.", "Run `hippodrome stop --all`.", [*stopper.errors])
         progress("removing pages, answers and recordings")
         bucket = VersionedBucket(self._context.account, self._context.installation["Bucket"])
-        recent = Records(self._documents).since(_made_at(self._documents, self.id))
-        records = [record for record in recent if record.project_id == self.id]
         places = [
-            *(server.key(record.label) for record in records),
+            *(server.key(record.label) for record in self.records()),
             entries.folder(self.id),
             decisions.key(self.id),
             questions_folder(self.id),
