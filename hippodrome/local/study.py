@@ -23,7 +23,6 @@ from hippodrome.local import own_cells, own_places
 from hippodrome.local.activity.log import ActivityLog
 from hippodrome.local.backend.authority import Authority
 from hippodrome.local.backend.platform import LocalPlatform
-from hippodrome.local.backend.processes import end_everything
 from hippodrome.local.lab import Host, Lab, qr
 from hippodrome.local.publish import NotPublished
 from hippodrome.local.stand_in import StandIn
@@ -77,7 +76,6 @@ class Study:
         self._authority = _authority(state.parent, tls, host, certificate)
         names_listener = listen(NAMES_PORT) if tls and host is None else None
         named_port: int | None = names_listener.getsockname()[1] if names_listener else None
-        _end_servers_of_other_addresses(state, named_port)
         listener = listen(port, host.bound) if host else listen(port)
         site = _site_context(self._authority, host, certificate)
         address = address_of(listener, site, host.shown if host else None)
@@ -124,14 +122,15 @@ class Study:
         """Start the servers' threads and the web server, print the link, and watch the project's files."""
         for config in self._configs.values():
             self._activity_log.set_steps(config.project.id, (step.key for step in config.steps))
-        self._platform.start()
+        lost = self._platform.start()
         self.server.start()
         if self._names is not None:
             self._names.start()
         self._banner()
-        playing_on = sum(bool(task.folder) for task in self._platform.tasks.playing())
-        if playing_on:
-            self._activity_log.say(f"{playing_on} server(s) of the last run play on")
+        if lost:
+            self._activity_log.say(
+                f"The last run was killed. Its {lost} server(s) were ended; each game goes on on another"
+            )
         for watch in self._watches:
             watch.start()
         self._activity_log.follow(self._platform.tasks, self._platform.documents.folder)
@@ -376,16 +375,3 @@ def from_here(path: Path) -> Path:
     """Return the path relative to the working directory, if it lies below that; otherwise the path itself."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
-
-
-def _end_servers_of_other_addresses(state: Path, named_port: int | None) -> None:
-    """End the servers of an earlier run if their addresses have another port than `named_port`. Raises OSError.
-
-    Browsers could not reach them. A file in `state` keeps the port for the next run.
-    """
-    file, now = state / "named-port", str(named_port or "")
-    state.mkdir(parents=True, exist_ok=True)
-    before = file.read_text() if file.exists() else ""
-    if before != now:
-        end_everything(state)
-        file.write_text(now)

@@ -89,11 +89,10 @@ def move(file: Path, path: Path) -> None:
     remove_if_possible(file)
 
 
-def replace(path: Path, data: bytes | Path, scratch: Path | None = None, *, durable: bool = True) -> None:
-    """Create or replace the file, with these bytes or with the content of another file.
+def replace(path: Path, data: bytes | Path, scratch: Path | None = None) -> None:
+    """Create or replace the file, with these bytes or with the content of another file, and bring it to the disk.
 
-    With `durable`, the new file is on the disk when this returns. Otherwise a power cut may restore the earlier file,
-    or leave no file, but never a part of one. `scratch` is as in `create`. Raises OSError.
+    `scratch` is as in `create`. Raises OSError.
     """
     unfinished = (scratch or path.parent) / f".{secrets.token_hex(8)}.new"
     try:
@@ -102,8 +101,7 @@ def replace(path: Path, data: bytes | Path, scratch: Path | None = None, *, dura
     except OSError:
         remove_if_possible(unfinished)
         raise
-    if durable:
-        sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
 def remove_if_possible(path: Path) -> None:

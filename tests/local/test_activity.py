@@ -2,16 +2,15 @@
 
 import io
 import json
-from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import pytest
 from rich.console import Console
 
 from hippodrome.local.activity.log import ActivityLog
 from hippodrome.local.activity.server_logs import WatchedServer
-from hippodrome.local.backend.task_record import TaskRecord, folder_of
+from hippodrome.local.backend.task_process import folder_of
 from hippodrome.local.backend.tasks import ProcessTasks
 from hippodrome.protocol.keys import answer_key, session_key
 from hippodrome.protocol.session import Member, SessionDocument
@@ -26,10 +25,7 @@ def answer(data: Path, user_id: str, step: str) -> None:
 
 
 def watched(data: Path, owner: str) -> WatchedServer:
-    task = TaskRecord(
-        "name-1", "hippodrome", "id", created="2026-11-22T22:00:00.000+00:00", folder=folder_of("study", owner)
-    )
-    return WatchedServer(task, data, data / "log", whole_log=True)
+    return WatchedServer(folder_of("study", owner), data, data / "log", whole_log=True)
 
 
 def test_answers_of_a_participants_server_are_printed_once(tmp_path: Path) -> None:
@@ -74,13 +70,18 @@ def test_the_terminal_names_who_has_played(tmp_path: Path, owner: str) -> None:
     assert "played step 3" in text.getvalue()
 
 
+class Task(NamedTuple):
+    name: str
+    folder: str
+
+
 class Running:
     """Stands for the processes' tasks."""
 
-    def __init__(self, *tasks: TaskRecord) -> None:
+    def __init__(self, *tasks: Task) -> None:
         self.tasks = tasks
 
-    def playing(self) -> tuple[TaskRecord, ...]:
+    def playing(self) -> tuple[Task, ...]:
         return self.tasks
 
     def log(self, name: str) -> Path:
@@ -90,8 +91,7 @@ class Running:
 def test_a_game_on_a_warm_server_that_ended_before_the_next_look_is_printed(tmp_path: Path) -> None:
     text = io.StringIO()
     log = ActivityLog(Console(file=text, width=200))
-    warm = TaskRecord("warm-1", "hippodrome", "id", created="2026-11-22T22:00:00.000+00:00", folder="")
-    given = replace(warm, folder=folder_of("study", "P1"))
+    warm, given = Task("warm-1", ""), Task("warm-1", folder_of("study", "P1"))
     answer(tmp_path, "P1", "1")
     record = {
         "projectId": "study",

@@ -39,7 +39,7 @@ def test_only_the_owner_may_read_the_files_of_a_study(local: Make) -> None:
     walker.answer(word="two")
     here.wait_for_text(r"server gone \(stopped\)")
     made = {path.name for path in here.data.rglob("*")} | {path.name for path in here.state.rglob("*")}
-    assert {"2.json", "2-episode-0001.jsonl.gz", "functions.log", "names.json", "spool"} <= made
+    assert {"2.json", "2-episode-0001.jsonl.gz", "functions.log", "spool"} <= made
     assert open_to_others(here.data, here.state.parent) == []
 
 

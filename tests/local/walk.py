@@ -40,6 +40,10 @@ class Walker:
         sent = self.http.post(self.link, data={**hidden(self.page()), **answers}, headers={"accept": "text/html"})
         assert sent.status_code == 303, sent.text
 
+    def ask_again(self) -> None:
+        """Ask for another server, after several were lost."""
+        self.answer(**{"hippodrome-action": "restart"})
+
     def until(self, wanted: str, seconds: float = PATIENCE, *, attempt: int | None = None) -> dict[str, Any]:
         """Wait until the game's server (of this attempt, if given) is in that state."""
         until = time.monotonic() + seconds

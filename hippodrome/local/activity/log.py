@@ -23,7 +23,7 @@ from rich.text import Text
 from hippodrome.control.model import ids
 from hippodrome.control.model.step_types import type_of
 from hippodrome.local.activity.server_logs import WatchedServer
-from hippodrome.local.backend.task_record import folder_of
+from hippodrome.local.backend.task_process import folder_of
 from hippodrome.local.backend.tasks import ProcessTasks
 
 LOOK = 0.5  # seconds between looks for what servers have written
@@ -265,7 +265,7 @@ class ActivityLog:
             for name, task in running.items():
                 watched = self._watched.get(name)
                 if watched is None:
-                    self._watched[name] = WatchedServer(task, data, tasks.log(name), whole_log)
+                    self._watched[name] = WatchedServer(task.folder, data, tasks.log(name), whole_log)
                 elif task.folder and watched.folder != task.folder:  # a warm server has been assigned
                     self._tell(watched)
                     watched.assign(task.folder)

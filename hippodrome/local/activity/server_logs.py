@@ -6,7 +6,6 @@ import contextlib
 import re
 from pathlib import Path
 
-from hippodrome.local.backend.task_record import TaskRecord
 from hippodrome.local.check.remedies import remedy
 from hippodrome.protocol import session
 from hippodrome.protocol.keys import participant_folder
@@ -21,13 +20,13 @@ class WatchedServer:
     With `whole_log`, errors that are in the log already are found, too.
     """
 
-    def __init__(self, task: TaskRecord, data: Path, log: Path, whole_log: bool) -> None:
+    def __init__(self, folder: str, data: Path, log: Path, whole_log: bool) -> None:
         self._data = data
         self._log = log
         self._read = 0 if whole_log else _size(log)
         self._rest = b""  # the beginning of a line that is not written to its end
         self._reader = ErrorReader(log)
-        self.assign(task.folder)
+        self.assign(folder)
 
     def assign(self, folder: str) -> None:
         """Set the folder of the participant or session that the server now belongs to.

@@ -1,14 +1,13 @@
-"""Queues on disk, and the threads that hand their messages to the functions: at least once, in batches, as SQS does.
+"""Queues in memory, and the threads that hand their messages to the functions: at least once, in batches, as SQS does.
 
-A message is stored as a file before `publish` returns; the file is removed once its function has succeeded. The file's
-name counts how often the message was received, so that a message that kills the process is given up too. A message that
-failed because of this machine (a full disk, no more files) is never given up: it is delivered again until it succeeds.
-Only the process that has locked the state folder writes here.
+A message that failed because of this machine (a full disk, no more files) is never given up: it is delivered again
+until it succeeds. If the process is killed, its messages are lost. That loses nothing that cannot be made again: the
+next start reports each server as lost (`platform.py`), the participants' pages ask again for what they wait for, and
+the sweep does what is left.
 """
 
 from __future__ import annotations
 
-import hashlib
 import heapq
 import json
 import threading
@@ -16,14 +15,11 @@ import time
 import traceback
 import uuid
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 from hippodrome.control.ports import Message, Topic
-from hippodrome.local.backend import files
-from hippodrome.local.backend.retry import Retry, reports_errors, start_thread
-from hippodrome.protocol import disk
+from hippodrome.local.backend.retry import Retry, start_thread
 
 Handler = Callable[[dict[str, Any], object], Any]
 Say = Callable[[str], None]
@@ -36,66 +32,48 @@ WORKERS = 2  # threads for each queue: SQS calls a function with several batches
 RETRY = (1, 2, 6, 24)
 """The seconds until a message that failed is delivered again: after its first failure, its second, and so on.
 
-After one failure more than there are numbers, the message is put aside. A message that has to wait until a server has
+After one failure more than there are numbers, the message is given up. A message that has to wait until a server has
 stopped succeeds before that, since a server stops within the sum of these seconds.
 """
 
 
 @dataclass(order=True)
 class _QueuedMessage:
-    """A message on its way; ordered by when it is due."""
+    """A message on its way; ordered by when it is due (`time.monotonic`)."""
 
     due: float
-    sent: float
     id: str
     body: str = field(compare=False)
     received: int = field(default=0, compare=False)
 
-    @property
-    def file(self) -> str:
-        return f"{self.id}.{self.received}.json"
+    def record(self) -> dict[str, Any]:
+        """The message as a record of an SQS event, with what the functions read of it."""
+        return {
+            "messageId": self.id,
+            "body": self.body,
+            "attributes": {"ApproximateReceiveCount": str(self.received)},
+            "eventSource": "aws:sqs",
+        }
 
 
 class _Queue:
-    """One queue: a folder, the messages by when they are due, and the threads that call the handler."""
+    """One queue: the messages by when they are due, and the threads that call the handler."""
 
-    def __init__(self, name: str, folder: Path, dead: Path, *, handler: Handler | None, say: Say, retry: Retry) -> None:
+    def __init__(self, name: str, handler: Handler | None, say: Say, retry: Retry) -> None:
         self.name = name
         self.handler = handler
         self._retry = retry
-        self._folder = folder
-        self._dead = dead
         self._say = say
         self._changed = threading.Condition()
         self._waiting: list[_QueuedMessage] = []
         self._busy = 0
         self._open = False
         self._threads: list[threading.Thread] = []
-        disk.make_folder(folder)
-        self._load()
-
-    def _load(self) -> None:
-        """Load the messages that an earlier process left; each is delivered when it is due. Raises OSError."""
-        for name in files.names(self._folder, ".json"):
-            path = self._folder / name
-            stored = files.read_json(path)
-            try:
-                id_, received = name.removesuffix(".json").rsplit(".", 1)
-                queued = _QueuedMessage(stored["due"], stored["sent"], id_, stored["body"], int(received))
-            except (TypeError, KeyError, ValueError):
-                self._say(f"a message in {path} cannot be read")
-                continue
-            heapq.heappush(self._waiting, queued)
 
     def put(self, message: Mapping[str, Any], seconds: float = 0) -> None:
-        """Store a message; it is due in so many seconds. Raises OSError."""
-        now = time.time()
+        """Deliver a message in so many seconds."""
         body = json.dumps(message, separators=(",", ":"))
-        queued = _QueuedMessage(now + seconds, now, str(uuid.uuid4()), body)
-        files.write_json(self._folder / queued.file, {"sent": queued.sent, "due": queued.due, "body": body})
-        with self._changed:
-            heapq.heappush(self._waiting, queued)
-            self._changed.notify()
+        self._push(_QueuedMessage(time.monotonic() + seconds, str(uuid.uuid4()), body))
 
     def start(self) -> None:
         self._open = True
@@ -106,8 +84,7 @@ class _Queue:
     def idle(self) -> bool:
         """Whether no due message waits and no handler runs."""
         with self._changed:
-            due = self._open and bool(self._waiting) and self._waiting[0].due <= time.time()
-            return not due and not self._busy
+            return not self._busy and not (self._open and self._is_due())
 
     def drain(self, until: float) -> bool:
         """Wait until the queue is idle, at most until `until` (monotonic); return whether it is."""
@@ -118,8 +95,6 @@ class _Queue:
         """Remove all messages, and return them in the order in which they are due."""
         with self._changed:
             messages, self._waiting = sorted(self._waiting), []
-        for queued in messages:
-            (self._folder / queued.file).unlink(missing_ok=True)
         return [json.loads(queued.body) for queued in messages]
 
     def stop(self, until: float) -> None:
@@ -130,121 +105,71 @@ class _Queue:
         for thread in self._threads:
             thread.join(max(0.0, until - time.monotonic()))
 
+    def _push(self, queued: _QueuedMessage) -> None:
+        with self._changed:
+            heapq.heappush(self._waiting, queued)
+            self._changed.notify()
+
+    def _is_due(self) -> bool:
+        return bool(self._waiting) and self._waiting[0].due <= time.monotonic()
+
     def _work(self) -> None:
         while batch := self._take():
-            try:
-                self._deliver(batch)
-            except Exception as error:  # noqa: BLE001 - the queue must go on, even with a full disk or without its folder
-                self._retry.report(error)
-                self._again(batch, counts=False)
-            finally:
-                with self._changed:
-                    self._busy -= 1
-                    self._changed.notify_all()
+            failed = self._call(batch)
+            # If this machine refused something lately, that may be the cause of the failure, even in another function.
+            counts = not self._retry.reported_within(RETRY[-1])
+            for queued in batch:
+                if queued.id in failed:
+                    self._again(queued, counts=counts)
+            with self._changed:
+                self._busy -= 1
+                self._changed.notify_all()
 
     def _take(self) -> list[_QueuedMessage]:
         """Wait for messages that are due, and return at most a batch of them; empty once the queue is stopped."""
         with self._changed:
             while self._open:
-                wait = self._waiting[0].due - time.time() if self._waiting else None
-                if wait is None or wait > 0:
-                    # At most half a minute: the machine may sleep, and its clock may be set.
-                    self._changed.wait(None if wait is None else min(wait, 30.0))
+                if not self._is_due():
+                    self._changed.wait(self._waiting[0].due - time.monotonic() if self._waiting else None)
                     continue
                 batch: list[_QueuedMessage] = []
-                while self._waiting and len(batch) < BATCH and self._waiting[0].due <= time.time():
+                while self._is_due() and len(batch) < BATCH:
                     batch.append(heapq.heappop(self._waiting))
                 self._busy += 1
                 return batch
         return []
 
-    def _deliver(self, batch: Sequence[_QueuedMessage]) -> None:
-        """Call the function with these messages; remove each that succeeded, and deliver the others again later."""
-        batch = [queued for queued in batch if self._count(queued)]
-        if not batch:
-            return
-        failed = self._call(batch)
-        # If this machine refused something lately, that may be the cause of the failure, even in another function.
-        counts = not self._retry.reported_within(RETRY[-1])
-        self._again([queued for queued in batch if queued.id in failed], counts=counts)
-        done = [queued for queued in batch if queued.id not in failed]
-        self._again([queued for queued in done if not self._remove(queued)], counts=False)
-
-    def _remove(self, queued: _QueuedMessage) -> bool:
-        """Remove the file of a message that has been handled; return False if this machine refuses that."""
-        try:
-            (self._folder / queued.file).unlink(missing_ok=True)
-        except OSError as error:
-            self._retry.report(error)
-            return False
-        return True
-
-    def _count(self, queued: _QueuedMessage) -> bool:
-        """Count one more receive in the file's name; return False if the file was removed. Raises OSError."""
-        before, after = self._folder / queued.file, replace(queued, received=queued.received + 1).file
-        try:
-            before.rename(self._folder / after)
-        except FileNotFoundError:
-            self._say(f"the message in {before} is gone: another program removed it")
-            return False
-        queued.received += 1
-        return True
-
     def _call(self, batch: Sequence[_QueuedMessage]) -> set[str]:
         """Call the function; return the ids of messages that failed: all if it raised or its answer is invalid."""
         everything = {queued.id for queued in batch}
-        if self.handler is None:
-            return everything
+        for queued in batch:
+            queued.received += 1
         try:
-            answer = self.handler({"Records": [_record(queued, self.name) for queued in batch]}, None)
+            answer = self.handler and self.handler({"Records": [queued.record() for queued in batch]}, None)
             failed = {item["itemIdentifier"] for item in (answer or {}).get("batchItemFailures") or ()}
-        except Exception:  # noqa: BLE001 - as with SQS, the batch is delivered again after any error
-            self._say(f"the function behind the {self.name} queue failed:\n{traceback.format_exc().rstrip()}")
+        except Exception as error:  # noqa: BLE001 - as with SQS, the batch is delivered again after any error
+            if isinstance(error, OSError):
+                self._retry.report(error)
+            else:
+                self._say(f"the function behind the {self.name} queue failed:\n{traceback.format_exc().rstrip()}")
             return everything
         return failed if failed <= everything else everything
 
-    def _again(self, failed: Sequence[_QueuedMessage], *, counts: bool) -> None:
-        """Deliver these again later. With `counts`, put a message aside that has been received too often."""
-        for queued in failed:
-            if counts and queued.received > len(RETRY) and self._put_aside(queued):
-                continue
-            queued.due = time.time() + RETRY[min(max(0, queued.received - 1), len(RETRY) - 1)]
-            with self._changed:
-                heapq.heappush(self._waiting, queued)
-                self._changed.notify()
-
-    def _put_aside(self, queued: _QueuedMessage) -> bool:
-        """Move the message's file to the folder `dead`; return False if this machine refuses that."""
-        try:
-            disk.make_folder(self._dead)
-            (self._folder / queued.file).rename(self._dead / queued.file)
-        except OSError as error:
-            self._retry.report(error)
-            return False
-        self._say(f"a message failed {queued.received} times and was put aside: {self._dead / queued.file}")
-        return True
+    def _again(self, queued: _QueuedMessage, *, counts: bool) -> None:
+        """Deliver this message again later. With `counts`, give it up if it has been received too often."""
+        if counts and queued.received > len(RETRY):
+            self._say(f"a message to the function behind the {self.name} queue failed too often and was given up")
+            return
+        queued.due = time.monotonic() + RETRY[min(queued.received, len(RETRY)) - 1]
+        self._push(queued)
 
 
-@reports_errors
-class FolderBus:
+class LocalBus:
     """Implements `control.ports.Bus`. `handlers` are the functions behind the queues `start`, `stop`, `task`."""
 
-    def __init__(
-        self, state: Path, handlers: Mapping[str, Handler], say: Say = print, retry: Retry | None = None
-    ) -> None:
-        """Raises OSError if messages cannot be read or stored in `state`."""
-        self.retry = retry or Retry(say)
-        self._queues = {
-            name: _Queue(
-                name,
-                state / "queue" / name,
-                state / "dead" / name,
-                handler=handlers.get(name),
-                say=say,
-                retry=self.retry,
-            )
-            for name in QUEUES
-        }
+    def __init__(self, handlers: Mapping[str, Handler], say: Say = print, retry: Retry | None = None) -> None:
+        retry = retry or Retry(say)
+        self._queues = {name: _Queue(name, handlers.get(name), say, retry) for name in QUEUES}
 
     def publish(self, topic: Topic, message: Message) -> None:
         self._queues[topic.value].put(message)
@@ -277,28 +202,7 @@ class FolderBus:
         return self._queues[queue].take_all()
 
     def close(self, seconds: float = 5.0) -> None:
-        """Stop delivering messages. Those that are left stay in their files."""
+        """Stop delivering messages."""
         until = time.monotonic() + seconds
         for queue in self._queues.values():
             queue.stop(until)
-
-
-def _record(queued: _QueuedMessage, queue: str) -> dict[str, Any]:
-    """The message as a record of an SQS event."""
-    sent = str(int(queued.sent * 1000))
-    return {
-        "messageId": queued.id,
-        "receiptHandle": queued.file,
-        "body": queued.body,
-        "attributes": {
-            "ApproximateReceiveCount": str(queued.received),
-            "SentTimestamp": sent,
-            "SenderId": "local",
-            "ApproximateFirstReceiveTimestamp": sent,
-        },
-        "messageAttributes": {},
-        "md5OfBody": hashlib.md5(queued.body.encode(), usedforsecurity=False).hexdigest(),
-        "eventSource": "aws:sqs",
-        "eventSourceARN": f"arn:aws:sqs:local:000000000000:{queue}",
-        "awsRegion": "local",
-    }

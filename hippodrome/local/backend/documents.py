@@ -17,13 +17,12 @@ import os
 import secrets
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
 
 from hippodrome.control.ports import Conflict, Document, Entry
 from hippodrome.local.backend import files
-from hippodrome.local.backend.retry import Retry, reports_errors
+from hippodrome.local.backend.retry import Retry
 from hippodrome.protocol import disk
 
 STRIPES = 64  # lock files; keys that share one wait for each other
@@ -32,17 +31,17 @@ _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
 Written = Callable[[str, bytes], None]
 
 
-@reports_errors
 class FolderDocuments:
     """Implements `hippodrome.control.ports.Documents`. ETags are MD5 in quotation marks, as S3's.
 
-    `written` is called with the key and the body of each document that this process writes, once it is on the disk.
+    An OSError is reported (`retry.py`) and raised on. `written` is called with the key and the body of each document
+    that this process writes, once it is on the disk.
     """
 
     def __init__(self, folder: Path, state: Path, written: Written | None = None, retry: Retry | None = None) -> None:
         """Raises OSError if documents cannot be stored in `folder`."""
         self.folder = folder.resolve()
-        self.retry = retry or Retry()
+        self._retry = retry or Retry()
         self._written = written
         self._locks = state / "locks"
         self._scratch = state / "scratch"
@@ -83,10 +82,11 @@ class FolderDocuments:
         path = self._path(key)
         if path is None:
             return None
-        try:
-            body = path.read_bytes()
-        except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
-            return None
+        with self._retry.reporting():
+            try:
+                body = path.read_bytes()
+            except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
+                return None
         etag = _etag(body)
         return known if known and known.etag == etag else Document(body, etag)
 
@@ -95,11 +95,12 @@ class FolderDocuments:
         file.
         """
         path = self._writable(key)
-        disk.make_folder(path.parent)
-        try:
-            disk.create(path, body, self._scratch)
-        except FileExistsError:
-            raise Conflict(key) from None
+        with self._retry.reporting():
+            disk.make_folder(path.parent)
+            try:
+                disk.create(path, body, self._scratch)
+            except FileExistsError:
+                raise Conflict(key) from None
         self._tell(key, body)
         return _etag(body)
 
@@ -134,7 +135,8 @@ class FolderDocuments:
         folder, _, start = prefix.rpartition("/")
         path = self._path(folder) if folder else self.folder
         if path is not None:
-            yield from _walk(path, f"{folder}/" if folder else "", start)
+            with self._retry.reporting():
+                yield from _walk(path, f"{folder}/" if folder else "", start)
 
     def delete(self, key: str) -> None:
         path = self._path(key)
@@ -166,8 +168,10 @@ class FolderDocuments:
             )
         return path
 
-    def _lock(self, key: str) -> AbstractContextManager[None]:
-        return files.locked(self._locks / str(zlib.crc32(os.fsencode(key)) % STRIPES))
+    @contextlib.contextmanager
+    def _lock(self, key: str) -> Iterator[None]:
+        with self._retry.reporting(), files.locked(self._locks / str(zlib.crc32(os.fsencode(key)) % STRIPES)):
+            yield
 
     def _tell(self, key: str, body: bytes) -> None:
         if self._written:

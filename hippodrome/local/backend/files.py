@@ -1,34 +1,14 @@
-"""Records of local mode as JSON files, and locks. `protocol/disk.py` writes files so that they survive a power cut."""
+"""Names in folders, and locks. `protocol/disk.py` writes files so that they survive a power cut."""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
-import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
-
-from hippodrome.protocol import disk
 
 PRIVATE = 0o600
-
-
-def write_json(path: Path, data: Any, *, durable: bool = True) -> None:
-    """Write a JSON file as a whole, and bring it to the disk. Raises OSError.
-
-    Without `durable`, a power cut may bring back the earlier content.
-    """
-    disk.replace(path, json.dumps(data, indent=1).encode(), durable=durable)
-
-
-def read_json(path: Path) -> Any:
-    """Return the content of a JSON file; None if there is no such file, or if it is not JSON. Raises other OSErrors."""
-    try:
-        return json.loads(path.read_bytes())
-    except (FileNotFoundError, ValueError):
-        return None
 
 
 def names(folder: Path, suffix: str = "") -> list[str]:
@@ -75,9 +55,6 @@ class Hold:
             note = os.read(self._handle, 1000).decode("utf-8", "replace")
             os.close(self._handle)
             raise InUse(note) from None
-        except OSError:
-            os.close(self._handle)
-            raise
         self.write("")
 
     def write(self, note: str) -> None:

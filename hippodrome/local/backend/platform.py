@@ -2,10 +2,12 @@
 
 The state folder holds everything that is not data:
 
-    queue/ dead/                             messages that are not handled yet, and those given up
-    timers/ tasks/ clusters/ names.json      what EventBridge Scheduler, ECS and Route 53 know on AWS
-    logs/ spool/                             logs of functions and servers, and recordings that are being written
-    locks/ scratch/                          locks of documents, and documents that are being written
+    logs/ spool/      logs of functions and servers, and recordings that are being written
+    tasks/            whose each running server is, for `erase`
+    locks/ scratch/   locks of documents, and documents that are being written
+
+What the functions still have to do, timers and names are in memory. If the process is killed, the next start makes of
+the servers' records what it needs (`start`).
 """
 
 from __future__ import annotations
@@ -20,22 +22,23 @@ from typing import Any, TypeVar
 
 from hippodrome.control.config import Config
 from hippodrome.control.model.project import MASTER_LIST
+from hippodrome.control.model.records import from_json
+from hippodrome.control.model.server import RECORDS, Server
 from hippodrome.control.ports import Conflict, Document, Settings, Topic
 from hippodrome.control.storage.secret import KEY
 from hippodrome.functions import installed, start_server, stop_server, sweep, task_changed
 from hippodrome.local.backend import files
-from hippodrome.local.backend.bus import FolderBus, Handler
-from hippodrome.local.backend.dns import FileDns
+from hippodrome.local.backend.bus import Handler, LocalBus
+from hippodrome.local.backend.dns import LocalDns
 from hippodrome.local.backend.documents import FolderDocuments, Written
 from hippodrome.local.backend.retry import Retry, start_thread
+from hippodrome.local.backend.task_process import KILLED, event
 from hippodrome.local.backend.tasks import PYTHON_TRIAL, STOP_TIMEOUT, ProcessTasks
-from hippodrome.local.backend.timers import FolderTimers
-from hippodrome.local.publish import NotPublished, publish
-from hippodrome.protocol import disk
+from hippodrome.local.backend.timers import LocalTimers
+from hippodrome.local.publish import publish
 
 DOMAIN = "localhost"
 GAME_PATH = "/game/"  # where browsers find the servers of a lab (`local/web/relay.py`)
-_OURS = ("queue", "tasks", "timers")  # folders in which no other process has unfinished files
 _KEPT = (KEY, MASTER_LIST)  # documents whose content cannot be made again
 SWEEP_FIRST, SWEEP_EVERY = 20.0, 600.0  # seconds
 LOOK = 0.5  # seconds between two looks whether the data still exist
@@ -82,7 +85,6 @@ class LocalPlatform:
         `more_folders` are those of further studies. With `lab`, the address of the web server, other machines take
         part: links are signed, and browsers find servers at that address, below GAME_PATH.
         """
-        self._state = state
         self._folders = (project_folder, *more_folders)
         self._is_lab = lab is not None
         self._subdomain = subdomain
@@ -100,9 +102,9 @@ class LocalPlatform:
         )
         self.retry = Retry(say)
         self.documents = FolderDocuments(data, state, written, self.retry)
-        self.dns = FileDns(state, self.retry, named=named_port is not None or not is_private)
-        self.bus = FolderBus(state, self._handlers, say, self.retry)
-        self.timers = FolderTimers(state, lambda message: self.bus.publish(Topic.STOP, message), say, retry=self.retry)
+        self.dns = LocalDns(named=named_port is not None or not is_private)
+        self.bus = LocalBus(self._handlers, say, self.retry)
+        self.timers = LocalTimers(lambda message: self.bus.publish(Topic.STOP, message))
         self.tasks = ProcessTasks(
             state,
             data,
@@ -123,7 +125,9 @@ class LocalPlatform:
         """
         folder = folder or self._folders[0]
         config = publish(folder, self.documents, self._subdomain, self._say, signed=self._is_lab)
-        self.tasks.add_project(config.project.id, folder, has_model=bool(config.models))
+        self.tasks.add_project(
+            config.project.id, folder, has_model=bool(config.models), keeps_recordings=config.trial.s3upload
+        )
         return config
 
     def port_of(self, name: str) -> int | None:
@@ -141,22 +145,36 @@ class LocalPlatform:
     def run_all(self, acts: Sequence[Callable[[], T]]) -> list[T]:
         return [act() for act in acts]
 
-    def start(self) -> None:
-        """Continue where the last process ended. Raises OSError if this machine refuses that."""
+    def start(self) -> int:
+        """Begin; end what a killed process has left, and return how many servers it has lost.
+
+        Raises OSError if this machine refuses that.
+        """
         installed.use(self)
         self.documents.tidy()
-        for unfinished in [*self._state.glob(".*.new"), *(f for d in _OURS for f in (self._state / d).rglob(".*.new"))]:
-            disk.remove_if_possible(unfinished)
-        documents_before = {key: self.documents.get(key) for key in _KEPT}
+        lost: list[Server] = []
         steps: list[Callable[[], object]] = [
-            self.tasks.start,
+            self.tasks.clear,
+            lambda: lost.extend(self._open_records()),
             self.bus.start,
-            self.timers.start,
             partial(start_thread, self._sweep, name="sweep"),
-            partial(start_thread, self._look_after, documents_before, name="guard"),
+            partial(start_thread, self._look_after, name="guard"),
         ]
         for step in steps:
             self.retry.run(step, seconds=START_RETRY_SECONDS)
+        for record in lost:
+            self.bus.emit(event(record.name, record.task or "", record.cluster, exit_code=KILLED))
+        self.bus.drain(START_RETRY_SECONDS)  # before a page is shown
+        return len(lost)
+
+    def _open_records(self) -> list[Server]:
+        """The records of servers that are not closed. Raises OSError."""
+        documents = [self.documents.get(entry.key) for entry in self.documents.list(RECORDS)]
+        records = []
+        for document in filter(None, documents):
+            with contextlib.suppress(ValueError):
+                records.append(from_json(document.body, Server))
+        return [record for record in records if not record.is_closed]
 
     def close(self, seconds: float = 5.0) -> None:
         """End every server, and let the functions clean up for some seconds. The next start does what is left to do."""
@@ -169,36 +187,25 @@ class LocalPlatform:
 
     # The data folder, which the researcher may delete while the study runs
 
-    def _look_after(self, documents_before: dict[str, Document | None]) -> None:
-        """Look whether the registration, the pages or the records were deleted; if so, publish the study again.
-
-        `kept` are the documents of `_KEPT`, as they were at the start.
-        """
-        previous, last, warned = frozenset[str](), frozenset[str](), False
+    def _look_after(self) -> None:
+        """Look whether the registration, the pages or the records were deleted; if so, publish the study again."""
+        kept: dict[str, Document] = {}  # the documents of `_KEPT`, as they were last
+        known, last = frozenset[str](), frozenset[str]()
         while not self._closed.wait(LOOK):
             try:
-                documents_before = {
-                    key: self.documents.get(key, before) or before for key, before in documents_before.items()
-                }
+                kept |= {key: document for key in _KEPT if (document := self.documents.get(key))}
                 existing = self._existing()
-            except OSError as error:  # what exists is not known, so nothing counts as deleted
-                self.retry.report(error)
+            except OSError:  # what exists is not known, so nothing counts as deleted
                 continue
-            deleted = previous - existing
-            if deleted and existing == last:  # the deletion is complete
-                if not warned:
-                    self._say(
-                        f"THE DATA FOLDER {self.documents.folder} WAS DELETED, or files in it that the study needs."
-                    )
-                try:
-                    self._begin_again(documents_before, servers="_servers" in deleted)
-                    previous, warned = self._existing(), False
-                except Exception as error:  # noqa: BLE001 - the next look tries again
-                    if not warned:
-                        self._say(f"The study cannot be published again (yet): {_reason(error)}")
-                    warned = True
-            elif not deleted:
-                previous = existing
+            if not known - existing:
+                known = existing
+            elif existing == last:  # the deletion is complete
+                self._say(f"THE DATA FOLDER {self.documents.folder} WAS DELETED, or files in it that the study needs.")
+                begin_again = partial(
+                    self._begin_again, kept, servers="_servers" not in existing and "_servers" in known
+                )
+                self.retry.run(begin_again, self._closed.wait)
+                known = frozenset()
             last = existing
 
     def _existing(self) -> frozenset[str]:
@@ -208,17 +215,13 @@ class LocalPlatform:
         names = [*(f"{project}/steps" for project in projects), *_KEPT, "_servers"]
         return frozenset(name for name in names if files.exists(folder / name))
 
-    def _begin_again(self, documents_before: Mapping[str, Document | None], *, servers: bool) -> None:
+    def _begin_again(self, kept: Mapping[str, Document], *, servers: bool) -> None:
         """Publish the study again. `servers`: whether the servers' records were deleted; then the servers are ended."""
         self.documents.prepare()
         ended = self.tasks.forget() if servers else 0
-        for (
-            key,
-            document,
-        ) in documents_before.items():  # written as they were, so that open pages and completion codes stay valid
-            if document:
-                with contextlib.suppress(Conflict):
-                    self.documents.create(key, document.body)
+        for key, document in kept.items():  # as they were, so that open pages and completion codes stay valid
+            with contextlib.suppress(Conflict):
+                self.documents.create(key, document.body)
         for folder in self._folders:
             self.publish(folder)
         installed.use(self)  # the functions forget what they have cached
@@ -243,10 +246,6 @@ def _game_sources(lab: str | None, named_port: int | None) -> str:
     if lab is not None:
         return lab.replace("http", "ws", 1)
     return f"wss://*.{DOMAIN}:{named_port}" if named_port else "ws://127.0.0.1:*"
-
-
-def _reason(error: Exception) -> str:
-    return "; ".join(error.problems) if isinstance(error, NotPublished) else f"{type(error).__name__}: {error}"
 
 
 def _scheduled(now: datetime) -> dict[str, Any]:

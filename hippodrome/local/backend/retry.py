@@ -6,14 +6,13 @@ again, with growing pauses, until it succeeds.
 
 from __future__ import annotations
 
+import contextlib
 import errno
-import functools
-import inspect
 import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from typing import TypeVar
 
 FIRST, LONGEST = 0.05, 10.0  # seconds between two attempts
 SILENCE = 60.0  # seconds for which the same sentence is not said again
@@ -36,7 +35,6 @@ _WORDS = {
 
 Say = Callable[[str], None]
 T = TypeVar("T")
-P = TypeVar("P")
 
 
 class Retry:
@@ -64,6 +62,15 @@ class Retry:
     def reported_within(self, seconds: float) -> bool:
         """Return whether `report` was called within the last `seconds`."""
         return time.monotonic() < self._last + seconds
+
+    @contextlib.contextmanager
+    def reporting(self) -> Iterator[None]:
+        """Within the block, an OSError is reported and raised on: the caller's queue, or participant, tries again."""
+        try:
+            yield
+        except OSError as error:
+            self.report(error)
+            raise
 
     def run(
         self, act: Callable[[], T], wait: Callable[[float], object] = time.sleep, seconds: float | None = None
@@ -97,49 +104,11 @@ def message_for(error: BaseException) -> str:
     return f"{words}. Nothing is lost: it is tried again until it works."
 
 
-def reports_errors(port: type[P]) -> type[P]:
-    """Decorate the class of a port: an OSError of a public method is reported to `self.retry`, and raised again."""
-    for name, method in list(vars(port).items()):
-        if not name.startswith("_") and inspect.isfunction(method):
-            wrap = _reporting_generator if inspect.isgeneratorfunction(method) else _reporting
-            setattr(port, name, wrap(method))
-    return port
-
-
-def _reporting(method: Callable[..., T]) -> Callable[..., T]:
-    @functools.wraps(method)
-    def reporting(self: Any, *args: Any, **options: Any) -> T:
-        try:
-            return method(self, *args, **options)
-        except OSError as error:
-            self.retry.report(error)
-            raise
-
-    return reporting
-
-
-def _reporting_generator(method: Callable[..., Iterator[T]]) -> Callable[..., Iterator[T]]:
-    @functools.wraps(method)
-    def reporting(self: Any, *args: Any, **options: Any) -> Iterator[T]:
-        try:
-            yield from method(self, *args, **options)
-        except OSError as error:
-            self.retry.report(error)
-            raise
-
-    return reporting
-
-
 def start_thread(target: Callable[..., object], *args: object, name: str) -> threading.Thread:
     """Start a daemon thread, and return it. Raises OSError (EAGAIN) if this machine gives no more threads."""
     thread = threading.Thread(target=target, args=args, name=name, daemon=True)
-    start(thread)
-    return thread
-
-
-def start(thread: threading.Thread) -> None:
-    """Start this thread. Raises OSError (EAGAIN) if this machine gives no more threads; may then be called again."""
     try:
         thread.start()
     except RuntimeError as error:
         raise OSError(errno.EAGAIN, str(error)) from error
+    return thread

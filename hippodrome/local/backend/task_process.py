@@ -1,38 +1,45 @@
-"""One task: the process of its server, followed from its start to its end.
+"""One server: its process, which a thread follows from its start to its end, and the ECS events that tell of it.
 
-No process is lost, even if `run` is killed: the task's record is written before its process begins, and again with
-the process id. An event is sent before the record says so; if `hippodrome run` is killed in between, it is sent again.
-
-Each server has a thread that follows it. If this machine refuses something, the thread tries again until it succeeds
-(`retry.py`). So it notices the end of each server, even with a full disk.
+If this machine refuses something, the thread tries again until it succeeds (`retry.py`). So it notices the end of each
+server, even with a full disk.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import filecmp
+import http.client
+import json
 import os
+import secrets
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
-import psutil
-
 from hippodrome.control.config import layout
-from hippodrome.control.ports import TaskRequest
-from hippodrome.local.backend import recordings
-from hippodrome.local.backend.health import is_healthy, port_in
-from hippodrome.local.backend.processes import child_of, kill_group, mark_of, process_of, spawn
+from hippodrome.control.ports import Refused, TaskRequest
+from hippodrome.local.backend.processes import kill_group, mark_of
 from hippodrome.local.backend.retry import Retry, start_thread
-from hippodrome.local.backend.task_record import HOST, KILLED, TaskFolder, TaskRecord, event, folder_of, now
 from hippodrome.local.inherited import inherited_environment
 from hippodrome.protocol import disk, environment, handover
+from hippodrome.protocol.keys import handover_key, with_number
+from hippodrome.protocol.session import owner_folder
 
+ARN = "arn:aws:ecs:local:000000000000"
+HOST = "127.0.0.1"
+KILLED = 137
+"""The exit code of a process that SIGKILL has ended."""
 START_TIMEOUT = 120.0  # seconds in which a server must listen
 RESCUE_TIMEOUT = 10.0  # seconds for which the event of a server's end waits for its recordings to be moved
+
+# Errors of a command that can never be run, however often it is tried.
+_REFUSED = (errno.ENOENT, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.ENOEXEC, errno.E2BIG, errno.EINVAL)
 
 T = TypeVar("T")
 Emit = Callable[[Mapping[str, Any]], None]
@@ -44,9 +51,6 @@ class Shared:
     """What all servers of a study share: folders, the command that runs them, and functions to report to."""
 
     state: Path
-    logs: Path
-    spool: Path  # where servers keep recordings that are not finished
-    files: TaskFolder
     data: Path
     project: Path
     command: Sequence[str]
@@ -57,277 +61,184 @@ class Shared:
     projects: dict[str, Path] = field(default_factory=dict)
     """The folders of projects by their ids. `project` is the folder of any other."""
     with_model: set[str] = field(default_factory=set)  # the ids of projects whose games have a language model
-    lock: threading.RLock = field(default_factory=threading.RLock)
+    unrecorded: set[str] = field(default_factory=set)  # the ids of projects that keep no recordings (`s3upload`)
     closed: threading.Event = field(default_factory=threading.Event)  # set when this process ends
 
-    def agent_folder(self, request: TaskRequest) -> Path:
-        """Return the folder of agent.py for this server."""
-        return layout.agent_folder(self.projects.get(self._project_id(request), self.project)).resolve()
+    def agent_folder(self, project_id: str) -> Path:
+        """Return the folder of this project's agent.py."""
+        return layout.agent_folder(self.projects.get(project_id, self.project)).resolve()
 
     def log(self, name: str) -> Path:
         """Return the log file of the server of this name."""
-        return self.logs / f"{name}.log"
+        return self.state / "logs" / f"{name}.log"
+
+    def note(self, name: str) -> Path:
+        """Return the file that says of a running server whose it is: `erase` reads it."""
+        return self.state / "tasks" / f"{name}.json"
+
+    @property
+    def spool(self) -> Path:
+        """The folder where servers keep recordings that are not finished."""
+        return self.state / "spool"
 
     def environment(self, request: TaskRequest) -> dict[str, str]:
         """Return the environment variables of a server's process."""
+        project_id = request.environment.get(environment.PROJECT_ID, "")
+        key = os.environ.get(environment.LLM_KEY)
         return {
             **inherited_environment(),
-            **self._model_key(request),
+            # Code of studies without a language model never sees the key.
+            **({environment.LLM_KEY: key} if key and project_id in self.with_model else {}),
             **request.environment,
             environment.STORE: str(self.data),
             environment.SPOOL: str(self.spool),
             environment.HOST: HOST,
             environment.PORT: "0",
             environment.TLS: "off",
-            environment.AGENT_DIR: str(self.agent_folder(request)),
+            environment.AGENT_DIR: str(self.agent_folder(project_id)),
             "PYTHONUNBUFFERED": "1",
         }
 
-    def _model_key(self, request: TaskRequest) -> dict[str, str]:
-        """The key of the language model, for servers of a project that has one: code of other studies never sees it."""
-        key = os.environ.get(environment.LLM_KEY)
-        return {environment.LLM_KEY: key} if key and self._project_id(request) in self.with_model else {}
+    def rescue(self, project_id: str, server: str = "*") -> None:
+        """Move recordings that a killed server left unfinished to the data. By default, of all servers of a project.
 
-    def _project_id(self, request: TaskRequest) -> str:
-        return request.environment.get(environment.PROJECT_ID, "")
+        They are cut off, but all lines before that place can be read. Raises OSError; it may then be called again.
+        """
+        if project_id in self.unrecorded:
+            return
+        for recording in sorted(self.spool.glob(f"{project_id}/*/*/trials/{server}/*.part")):
+            if recording.stat().st_size:  # else the disk was full, or the server was killed in the first half second
+                _move(recording, (self.data / recording.relative_to(self.spool)).with_suffix(""))
+            recording.unlink(missing_ok=True)
 
 
 class TaskProcess:
-    """A task with its process, and the thread that follows it."""
+    """A server: a process, and the thread that follows it."""
 
-    def __init__(self, task: TaskRecord, shared: Shared) -> None:
-        self.task = task
-        self.begun = threading.Event()  # set when there is a process, or will be none
+    def __init__(self, request: TaskRequest, shared: Shared) -> None:
+        variables = request.environment
+        self.name, self.cluster = request.name, request.cluster
+        self.token = variables.get(environment.TOKEN)  # by which servers of the same name differ
+        self.project_id = variables.get(environment.PROJECT_ID, "")
+        self.port: int | None = None
+        self.runs = False
+        self.over = False  # whether the process is gone; its last event may not be sent yet
+        self.asked: str | None = None  # the reason for which it was asked to stop
+        self.silent = False  # no event is sent: the server's record was deleted, and a new server may have its name
         self.gone = threading.Event()  # set when the process is gone and its last event is sent
-        self.forgotten = threading.Event()  # set when the record's file is removed: it is not written any more
-        self.silent = False  # no events are sent: the server's record was deleted, and a new server may have its name
-        self.unsaved = False  # whether the task has changed since it was saved
+        owner = variables.get(environment.SESSION) or variables.get(environment.USER_ID)
+        self.folder = folder_of(self.project_id, owner) if owner else ""
+        """The folder of the participant or session, below the data; empty until a warm server is assigned."""
+        self.server = request.name
+        """The name of its folder of recordings: that of the participant's server."""
+        self._handover = ""  # the key of a warm server's handover
+        if variables.get(environment.WARM_SERVER) == "on":
+            self._handover = handover_key(self.project_id, variables.get(environment.SERVER, ""))
+        self._id = secrets.token_hex(16)
         self._shared = shared
-        self._child: subprocess.Popen[bytes] | None = None
-        self._ending: threading.Thread | None = None
-        self._exit_code: int | None = None
-        self._over = False  # whether the process is gone; its last event may not be sent yet
+        self._process = self._spawn(request)
+        try:
+            start_thread(self._follow, name=f"task {self.name}")
+        except OSError:
+            kill_group(self._process.pid)
+            self._process.wait()
+            raise
+
+    @property
+    def arn(self) -> str:
+        return f"{ARN}:task/{self.cluster}/{self._id}"
+
+    @property
+    def interface(self) -> str:
+        return f"eni-{self._id[:17]}"
 
     @property
     def lives(self) -> bool:
         """Whether the task counts as running. As in ECS's lists, a task that was asked to stop does not."""
-        return not self._over and self.task.status != "STOPPED" and self.task.asked is None
+        return not self.over and self.asked is None
 
-    # What `ProcessTasks` calls
-
-    def begin(self, request: TaskRequest) -> None:
-        """Start the process, and a thread that follows it once the caller has set `begun`.
-
-        If one of the two cannot be started, neither runs. Raises `Refused` if the command can never be run, and OSError
-        if it may be possible later.
-        """
-        self._save()
-        self._shared.files.remove_notes(self.task.name)
+    def end(self, reason: str, seconds: float) -> None:
+        """Send SIGTERM, and SIGKILL after so many seconds. Returns at once."""
+        with contextlib.suppress(OSError):
+            self.read_handover()  # the caller removes the handover afterwards
+        if self.asked is not None or self.over:
+            return
+        self.asked = reason
+        self._process.terminate()
         try:
-            self._follow()
-            self._child = self._spawn(request)
-        except BaseException:
-            self.forgotten.set()
-            self.begun.set()
-            # If the file stays, `ProcessTasks.start` sees by it that no process began.
-            disk.remove_if_possible(self._shared.files.file(self.task.name))
-            raise
-        # The process runs now, so nothing may fail here: the thread saves its id.
-        self.task, self.unsaved = replace(self.task, pid=self._child.pid), True
-
-    def take_up(self) -> None:
-        """Follow the process that an earlier `run` has started; if it has ended, send the event of its end."""
-        self._follow()
-        self.begun.set()
-
-    def end(self, reason: str, until: float, *, even_unsaved: bool = False) -> None:
-        """Send SIGTERM, and SIGKILL at the time `until` (`time.monotonic`). Returns at once.
-
-        Raises OSError if the reason cannot be saved; then no signal is sent, unless `even_unsaved` is True.
-        """
-        with self._shared.lock:
-            if self.task.status == "STOPPED":
-                return
-            try:
-                self.read_handover()  # the caller removes the handover afterwards
-                self._see_out_later(until)
-                self._save(asked=self.task.asked or reason)
-            except OSError:
-                if not even_unsaved:
-                    raise
-                self.task, self.unsaved = replace(self.task, asked=self.task.asked or reason), True
-                try:
-                    self._see_out_later(until)
-                except OSError:  # no thread can be started: SIGKILL at once
-                    self.kill_at_once()
-
-    def kill_at_once(self) -> None:
-        """Send SIGKILL, unless the process is known to have ended."""
-        try:
-            lives = self._lives()
+            start_thread(self._kill_after, seconds, name=f"end {self.name}")
         except OSError:
-            lives = True
-        if lives:
-            kill_group(self.task.pid)
+            self.kill()
 
-    def forget(self) -> None:
-        """Remove the task's file, and do not write it again. Raises OSError."""
-        self.forgotten.set()
-        self._shared.files.file(self.task.name).unlink(missing_ok=True)
+    def kill(self) -> None:
+        """Send SIGKILL to the process and all that it has started."""
+        if not self.over:
+            kill_group(self._process.pid)
 
     def read_handover(self) -> None:
-        """If the task is a warm server that has been assigned, save its participant or session. Raises OSError."""
-        with self._shared.lock, contextlib.suppress(FileNotFoundError, handover.BadHandover):
-            task = self.task
-            if task.handover_key and not task.folder and not self.forgotten.is_set():
-                handover_read = handover.parse((self._shared.data / task.handover_key).read_bytes())
-                project = task.handover_key.partition("/")[0]
-                self._save(folder=folder_of(project, handover_read.user_id), server=handover_read.server)
-
-    @property
-    def unfinished(self) -> Sequence[Path]:
-        """The task's recordings that are still in the spool. Raises OSError."""
-        return recordings.unfinished(self._shared.spool, self.task)
-
-    # Its process
+        """If it is a warm server that has been assigned, note for whom. Raises OSError."""
+        if self._handover and not self.folder:
+            with contextlib.suppress(FileNotFoundError, handover.BadHandover):
+                assigned = handover.parse((self._shared.data / self._handover).read_bytes())
+                self.server, self.folder = assigned.server, folder_of(self.project_id, assigned.user_id)
+                self._note()
 
     def _spawn(self, request: TaskRequest) -> subprocess.Popen[bytes]:
-        return spawn(
-            self._shared.command,
-            self._shared.files.path / self.task.name,
-            self._log,
-            mark=self._mark,
-            folder=self._shared.agent_folder(request),
-            environment=self._shared.environment(request),
-        )
+        """Start the process, in its own session. Raises `Refused` if it can never run, and OSError if it may later."""
+        program, *arguments = self._shared.command
+        with self._shared.log(self.name).open("wb") as output:
+            try:
+                return subprocess.Popen(  # noqa: S603 - our own command
+                    [program, "-X", mark_of(self._shared.state, self.name), *arguments],
+                    env=self._shared.environment(request),
+                    cwd=self._shared.agent_folder(self.project_id),
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,
+                )
+            except OSError as error:
+                if error.errno in _REFUSED:
+                    raise Refused(f"{program}: {error.strerror}") from error
+                raise
 
     def _follow(self) -> None:
-        start_thread(self._life, name=f"task {self.task.name}")
-
-    def _life(self) -> None:
-        """Follow the process from its start to its end: send an event for each change, and save that it was sent."""
-        self.begun.wait()
-        if self.task.status != "STOPPED":
-            self._retry(self._see_start)
-            self._retry(self._wait)
-            self._rescue_in_time()
-            self._retry(self._send_end)
-        self._retry(self._clear)
+        """Follow the process from its start to its end, and send an event for each change."""
+        self._retry(self._note)
+        if self._retry(self._listens):
+            self.runs = True
+            self._tell()
+        exit_code = self._process.wait()
+        kill_group(self._process.pid)  # what it has left running ends with it, as in a container
+        self._rescue_in_time()
+        self.over = True  # before the event is sent: its receiver must not find the task in `list`
+        self._tell(exit_code if exit_code >= 0 else 128 - exit_code)
         self.gone.set()
+        self._retry(self._clear)
 
     def _retry(self, act: Callable[[], T], seconds: float | None = None) -> T | None:
-        """Call `act` until it succeeds, and return its result; None if `run` ends or the server is forgotten."""
-
-        def over() -> bool:
-            return self._shared.closed.is_set() or self.forgotten.is_set()
-
-        def wait(pause: float) -> bool:
-            return self.forgotten.wait(pause) or over()
-
-        return None if over() else self._shared.retry.run(act, wait, seconds)
-
-    def _see_start(self) -> None:
-        """Send the events PROVISIONING and RUNNING, if they have not been sent. Raises OSError."""
-        if self.task.version == 0:
-            self._send()
-        elif self.unsaved:
-            self._save()
-        if self.task.asked:  # an earlier `hippodrome run` told it to stop, and was killed before it had ended
-            self.end(self.task.asked, time.monotonic() + self._shared.stop_timeout)
-        if self.task.status == "PROVISIONING" and self._listens():
-            self._send(status="RUNNING", started=now())
+        """Call `act` until it succeeds, and return its result; None if `run` ends."""
+        return self._shared.retry.run(act, self._shared.closed.wait, seconds)
 
     def _listens(self) -> bool:
-        """Wait until the server answers; return False if it ends. Kill it after `START_TIMEOUT`. Raises OSError."""
+        """Wait until the server answers; return False if it ends. Kill it after START_TIMEOUT. Raises OSError."""
         until = time.monotonic() + START_TIMEOUT
-        while self._lives():
-            port = port_in(self._log)
-            if port and is_healthy(port):
-                self._save(port=port)
+        while self._process.poll() is None:
+            port = _port_in(self._shared.log(self.name))
+            if port and _is_healthy(port):
+                self.port = port
                 return True
             if time.monotonic() > until:
-                self._shared.say(f"server {self.task.name} does not answer and is ended; see {self._log}")
-                self._kill()
+                log = self._shared.log(self.name)
+                self._shared.say(f"server {self.name} does not answer and is ended; see {log}")
+                self.kill()
                 return False
             time.sleep(0.05)
         return False
 
-    def _lives(self) -> bool:
-        if self._child:
-            return self._child.poll() is None
-        return process_of(self.task.pid, self._mark) is not None
-
-    def _wait(self) -> None:
-        """Wait until it ends; then kill what it has left running, as the end of a container does."""
-        process = self._child or process_of(self.task.pid, self._mark)
-        if process:
-            process.wait()
-            kill_group(process.pid)
-
-    def _send_end(self) -> None:
-        """Send the event STOPPED, if it has not been sent. Raises OSError."""
-        if self.task.status == "STOPPED":  # the event was sent, but that is not saved yet
-            self._save()
-            return
-        self._exit_code = self._find_exit_code()
-        self._over = True  # before the event is sent: its receiver must not find the task in `list`
-        self._send(status="STOPPED", stopped=now())
-
-    def _find_exit_code(self) -> int | None:
-        """The server's exit code; None if no process began. Raises OSError."""
-        note = self._shared.files.note(self.task.name, "exit")
-        if note.isdecimal():
-            return int(note)
-        if self._child and self._child.returncode is not None and self._child.returncode >= 0:
-            return self._child.returncode  # the server's code; the shell could not write its note
-        return KILLED if self.task.pid else None  # the shell was killed with the server, and wrote no note
-
-    def _clear(self) -> None:
-        """Move the recordings that are left, and remove the notes of the shell. Raises OSError."""
-        try:
-            self._rescue()
-            self._shared.files.remove_notes(self.task.name)
-        finally:
-            self.gone.set()  # set even if a step above fails: no caller waits until all succeed
-
-    # Its end
-
-    def _see_out_later(self, until: float) -> None:
-        """Start the thread that ends the server, if none does so already. Raises OSError."""
-        if not (self._ending and self._ending.is_alive()):
-            self._ending = start_thread(self._see_out, until, name=f"end {self.task.name}")
-
-    def _see_out(self, until: float) -> None:
-        """Send SIGTERM, and SIGKILL at `until`."""
-        with self._shared.lock:  # held by `end` until the reason is saved
-            if not self.task.asked:
-                return
-        self._retry(lambda: self._terminate_soon(until))
-        if not self.gone.wait(max(0.0, until - time.monotonic())):
-            self._retry(self._kill)
-
-    def _terminate_soon(self, until: float) -> None:
-        """Send SIGTERM to the server as soon as there is one."""
-        while not self.gone.is_set() and time.monotonic() < until:
-            if self._terminate():
-                break
-            self.gone.wait(0.02)  # the shell has not started the server yet
-
-    def _terminate(self) -> bool:
-        """Send SIGTERM to the server; return False if there is no process of it. Raises OSError."""
-        note, mark = self._shared.files.note(self.task.name, "pid"), self._mark
-        server = process_of(int(note), mark) if note.isdecimal() else child_of(self.task.pid, mark)
-        if server is None:
-            return False
-        with contextlib.suppress(psutil.NoSuchProcess):
-            server.terminate()
-        return True
-
-    def _kill(self) -> None:
-        if not self.gone.is_set() and self._lives():
-            kill_group(self.task.pid)
-
-    # Its recordings
+    def _kill_after(self, seconds: float) -> None:
+        if not self.gone.wait(seconds):
+            self.kill()
 
     def _rescue_in_time(self) -> None:
         """Move the recordings before the event of the end is sent, since the next server resumes from them.
@@ -337,37 +248,97 @@ class TaskProcess:
         try:
             self._retry(self._rescue, RESCUE_TIMEOUT)
         except Exception:  # noqa: BLE001 - `_clear` tries again
-            name = self.task.name
-            self._shared.say(f"a recording of server {name} cannot be moved to the data yet; it is tried again")
+            self._shared.say(f"a recording of server {self.name} cannot be moved to the data yet; it is tried again")
 
     def _rescue(self) -> None:
-        """Move recordings that a killed server left unfinished to the data folder. Raises OSError."""
+        """Move its unfinished recordings; if its data were deleted, delete them, too. Raises OSError."""
         self.read_handover()
-        recordings.move_to_data(self._shared.spool, self._shared.data, self.task)
+        if self.silent:
+            for path in self._shared.spool.glob(f"{self.project_id}/*/*/trials/{self.server}/*.part"):
+                path.unlink(missing_ok=True)
+        elif self.folder:
+            self._shared.rescue(self.project_id, self.server)
 
-    # Its record and its events
+    def _clear(self) -> None:
+        self._rescue()
+        self._shared.note(self.name).unlink(missing_ok=True)
 
-    def _save(self, **changes: Any) -> None:
-        """Write the changed task to its file, then keep it here. Raises OSError."""
-        with self._shared.lock:
-            task = replace(self.task, **changes)
-            if not self.forgotten.is_set():
-                self._shared.files.save(task)
-            self.task, self.unsaved = task, False
+    def _note(self) -> None:
+        """Write down whose server it is, and its process id. Raises OSError."""
+        disk.replace(
+            self._shared.note(self.name), json.dumps({"folder": self.folder, "pid": self._process.pid}).encode()
+        )
 
-    def _send(self, **changes: Any) -> None:
-        """Send the event of the changed task, then save the task. Raises OSError."""
-        task = replace(self.task, version=self.task.version + 1, **changes)
+    def _tell(self, exit_code: int | None = None) -> None:
+        """Send the event that it runs, or that it has ended with this exit code."""
         if not self.silent:
-            self._shared.emit(event(task, self._exit_code))
-        with self._shared.lock:
-            self.task, self.unsaved = replace(self.task, version=task.version, **changes), True
-            self._save()
+            self._shared.emit(
+                event(self.name, self.arn, self.cluster, self.interface, exit_code=exit_code, asked=self.asked)
+            )
 
-    @property
-    def _log(self) -> Path:
-        return self._shared.log(self.task.name)
 
-    @property
-    def _mark(self) -> str:
-        return mark_of(self._shared.state, self.task.name)
+def event(
+    name: str, arn: str, cluster: str, interface: str = "", *, exit_code: int | None = None, asked: str | None = None
+) -> dict[str, Any]:
+    """Return the "ECS Task State Change" event that a task runs; with an exit code, that it has ended.
+
+    `asked` is the reason for which it was asked to stop. The event has what the functions read of one.
+    """
+    detail: dict[str, Any] = {
+        "taskArn": arn,
+        "clusterArn": f"{ARN}:cluster/{cluster}",
+        "lastStatus": "RUNNING" if exit_code is None else "STOPPED",
+        "desiredStatus": "RUNNING" if exit_code is None and asked is None else "STOPPED",
+        "startedBy": name,
+        "attachments": [{"type": "eni", "details": [{"name": "networkInterfaceId", "value": interface}]}],
+    }
+    if exit_code is not None:
+        killed = ": the process was killed" if exit_code == KILLED else ""
+        detail |= {
+            "stopCode": "EssentialContainerExited" if asked is None else "UserInitiated",
+            "stoppedReason": asked or f"Essential container in task exited{killed}",
+            "containers": [{"name": "trial", "exitCode": exit_code}],
+        }
+    return {"source": "aws.ecs", "detail-type": "ECS Task State Change", "detail": detail}
+
+
+def folder_of(project_id: str, owner: str) -> str:
+    """Return the folder of a participant or a session, relative to the data folder and without a slash at its end.
+
+    `owner` is the participant's or the session's id.
+    """
+    return owner_folder(project_id, owner).rstrip("/")
+
+
+def _move(file: Path, place: Path) -> None:
+    """Move a recording without overwriting a file, even to another file system. Can be called again if interrupted."""
+    disk.make_folder(place.parent)
+    for number in count(1):
+        numbered = place.with_name(with_number(place.name, number))
+        try:
+            disk.move(file, numbered)
+        except FileExistsError:
+            if not filecmp.cmp(file, numbered, shallow=False):
+                continue  # another recording has that name
+        break
+
+
+def _port_in(log: Path) -> int | None:
+    """The port that the server has written into its log; None if there is none yet. Raises OSError."""
+    for line in log.read_bytes().split(b"\n")[:-1]:
+        if line.startswith(b'{"port"'):
+            with contextlib.suppress(ValueError, KeyError, TypeError):
+                return int(json.loads(line)["port"])
+    return None
+
+
+def _is_healthy(port: int) -> bool:
+    """Whether the server at this port answers. Raises OSError if this machine refuses the connection."""
+    connection = http.client.HTTPConnection(HOST, port, timeout=2)
+    try:
+        connection.request("GET", "/healthz")
+        return connection.getresponse().status == 200
+    except (ConnectionError, TimeoutError, http.client.HTTPException):
+        return False
+    finally:
+        connection.close()

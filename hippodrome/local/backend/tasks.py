@@ -1,42 +1,37 @@
 """Servers as processes of this machine, and their ECS events.
 
 Each server is `python -m hippodrome.trial` in a process of its own. `task_process.py` follows one from its start to its
-end; this module has the list of all. The next `hippodrome run` finds each server again by its file (`task_record.py`).
+end; this module has the list of all. Servers end with the `run` that started them. If it is killed they play on, and
+store what is played; the next `run` ends them, moves their recordings to the data, and reports them as lost
+(`platform.py`), so that each game goes on where it was, on another server.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import sys
+import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hippodrome.control.ports import Address, RunningTask, TaskRequest
-from hippodrome.local.backend import files
-from hippodrome.local.backend.processes import is_shell, kill, marked
-from hippodrome.local.backend.retry import Retry, reports_errors
-from hippodrome.local.backend.task_process import Emit, Say, Shared, TaskProcess
-from hippodrome.local.backend.task_record import HOST, TaskFolder, TaskRecord, claim_of
-from hippodrome.protocol import disk
+from hippodrome.local.backend.processes import end_everything
+from hippodrome.local.backend.retry import Retry
+from hippodrome.local.backend.task_process import HOST, Emit, Say, Shared, TaskProcess
+from hippodrome.protocol import disk, environment
 
 KILLED_SECONDS = 5.0  # in which a server must be gone after SIGKILL, when local mode ends
+LEFT_SECONDS = 5.0  # in which a server that a killed `run` has left may store what it has
 STOP_TIMEOUT = 30.0  # seconds from SIGTERM to SIGKILL, the default of ECS and of `STOP_SECONDS` (on AWS: 120)
-KEPT_TASKS, KEPT_LOGS = 200, 50  # the most records and logs of stopped servers that are kept
+KEPT_LOGS = 50  # the most logs of earlier servers that are kept
 
-PYTHON_TRIAL = (
-    sys.executable,
-    "-P",
-    "-m",
-    "hippodrome.trial",
-)  # -P: a project's random.py must not stand in for Python's
+# -P: a project's random.py must not stand in for Python's
+PYTHON_TRIAL = (sys.executable, "-P", "-m", "hippodrome.trial")
 
 
-@reports_errors
 class ProcessTasks:
-    """Implements `hippodrome.control.ports.Tasks`. `emit` takes an event and returns when it is stored."""
+    """Implements `hippodrome.control.ports.Tasks`. `emit` takes an event."""
 
     def __init__(
         self,
@@ -53,139 +48,92 @@ class ProcessTasks:
     ) -> None:
         """`named_port`: the port at which browsers find all servers by their names (`hippodrome/local/web/names.py`).
 
-        None: each server has its own port. Raises OSError if the files of servers cannot be read or written in `state`.
+        None: each server has its own port. Raises OSError if nothing can be written in `state`.
         """
-        self.retry = retry or Retry(say)
-        self._state = state.resolve()
         self._named_port = named_port
-        self._files = TaskFolder(self._state / "tasks")
-        self._clusters = self._state / "clusters"
         self._shared = Shared(
-            state=self._state,
-            logs=state / "logs",
-            spool=self._state / "spool",
-            files=self._files,
+            state=state.resolve(),
             data=data.resolve(),
             project=project_folder.resolve(),
             command=tuple(command),
             stop_timeout=stop_timeout,
             emit=emit,
             say=say,
-            retry=self.retry,
+            retry=retry or Retry(say),
         )
-        for folder in (self._files.path, self._shared.logs, self._shared.spool, self._clusters):
-            disk.make_folder(folder)
-        self._lock = self._shared.lock
-        self._servers: dict[str, TaskProcess] = {}  # by name: all servers, also those that have stopped
+        for name in ("tasks", "logs", "spool"):
+            disk.make_folder(self._shared.state / name)
+        self._clusters: set[str] = set()
+        self._lock = threading.Lock()
+        self._servers: dict[str, TaskProcess] = {}  # by name: all servers, also those that have ended
         self._closing = False
-        self._load()
 
     # The port
 
     def run(self, request: TaskRequest) -> str:
-        claim = claim_of(request)
-        task_server = self._servers.get(request.name)
-        if task_server and task_server.task.claim not in (
-            "",
-            claim,
-        ):  # the record of that earlier server was deleted with the data
+        earlier, token = self._servers.get(request.name), request.environment.get(environment.TOKEN)
+        if earlier and earlier.token != token:  # the record of that earlier server was deleted with the data
             self.forget([request.name])
-        with self._lock:
+        with self._lock, self._shared.retry.reporting():
             if self._closing:
                 raise RuntimeError("local mode is ending: no server is started any more")
-            task_server = self._servers.get(request.name)
-            if task_server:
-                return task_server.task.arn
-            id_ = hashlib.sha256(f"{self._state}\0{request.name}\0{time.time_ns()}".encode()).hexdigest()[:32]
-            task = TaskRecord.of(request, id_)
-            server = TaskProcess(task, self._shared)
-            server.begin(request)
-            self._servers[request.name] = server
-            server.begun.set()
-        return task.arn
+            if request.name not in self._servers:
+                self._servers[request.name] = TaskProcess(request, self._shared)
+            return self._servers[request.name].arn
 
     def stop(self, task: str, cluster: str, reason: str) -> None:
-        server = next((candidate for candidate in self._all() if candidate.task.arn == task), None)
-        if server:
-            server.end(reason, time.monotonic() + self._shared.stop_timeout)
+        for server in self._all():
+            if server.arn == task:
+                server.end(reason, self._shared.stop_timeout)
 
-    def addresses(self, interfaces: Sequence[str]) -> Mapping[str, Address]:
-        wanted_ids = set(interfaces)
+    def addresses(self, interfaces: Sequence[str]) -> dict[str, Address]:
         return {
-            task.interface: Address(HOST, self._named_port or task.port)
-            for task in (server.task for server in self._all() if server.lives)
-            if task.interface in wanted_ids and task.port
+            server.interface: Address(HOST, self._named_port or server.port)
+            for server in self._all()
+            if server.lives and server.port and server.interface in interfaces
         }
-
-    def port_of(self, label: str) -> int | None:
-        """Return the port of the newest server that has this label in its DNS name; None if there is none.
-
-        The label is the server's name, or its participant's id in lower case.
-        """
-        listening = [server.task for server in self._all() if server.lives and server.task.port]
-        servers_named = [
-            task for task in listening if label in (task.name, task.folder.rstrip("/").rpartition("/")[2].lower())
-        ]
-        return max(servers_named, key=lambda task: task.created).port if servers_named else None
 
     def find(self, name: str, cluster: str) -> str | None:
         server = self._servers.get(name)
-        return server.task.arn if server and server.lives and server.task.cluster == cluster else None
+        return server.arn if server and server.lives and server.cluster == cluster else None
 
     def list(self) -> Iterator[RunningTask]:
-        for task in (server.task for server in self._all() if server.lives):
-            runs = task.status == "RUNNING"
-            yield RunningTask(task.arn, task.cluster, task.name, task.interface if task.port else None, runs)
+        for server in self._all():
+            if server.lives:
+                interface = server.interface if server.port else None
+                yield RunningTask(server.arn, server.cluster, server.name, interface, server.runs)
 
     def create_cluster(self, name: str) -> None:
-        (self._clusters / name).touch()
-        disk.sync_folder(self._clusters)
+        self._clusters.add(name)
 
     def delete_cluster(self, name: str) -> None:
         if any(task.cluster == name for task in self.list()):
             raise RuntimeError("the cluster still contains tasks")
-        (self._clusters / name).unlink(missing_ok=True)
+        self._clusters.discard(name)
 
     def clusters(self) -> Iterator[str]:
-        yield from files.names(self._clusters)
+        yield from sorted(self._clusters)
 
     # What local mode calls beside the port
 
-    def add_project(self, project_id: str, folder: Path, *, has_model: bool = False) -> None:
+    def add_project(
+        self, project_id: str, folder: Path, *, has_model: bool = False, keeps_recordings: bool = True
+    ) -> None:
         """Servers of this project run the code in this folder, from now on; those with a language model get its key."""
         self._shared.projects[project_id] = folder.resolve()
         (self._shared.with_model.add if has_model else self._shared.with_model.discard)(project_id)
+        (self._shared.unrecorded.discard if keeps_recordings else self._shared.unrecorded.add)(project_id)
 
-    def start(self) -> None:
-        """Take over the servers of an earlier process: follow each that runs, and send the last events of the others.
-
-        Raises OSError; it may then be called again.
-        """
-        found = marked(self._state)
-        for server in self._all():
-            if server.begun.is_set():  # an earlier call has taken it up
-                found.pop(server.task.name, None)
-                continue
-            if server.task.status == "STOPPED":
-                if server.unfinished:
-                    server.take_up()
-                continue
-            processes = found.pop(server.task.name, [])
-            shell = next((p for p in processes if is_shell(p)), None)
-            never_began = server.task.pid is None and not processes and not self._files.note(server.task.name, "exit")
-            if never_began:
-                # The record was written, but no process began. The message that requested it is delivered again.
-                self._forget(server)
-                continue
-            if not shell:
-                kill(processes)
-            elif shell.pid != server.task.pid:
-                server.task, server.unsaved = replace(server.task, pid=shell.pid), True
-            server.take_up()
-        for leaked in found.values():
-            kill(leaked)
-        with contextlib.suppress(OSError):
-            self._prune()
+    def clear(self) -> None:
+        """End the servers that a killed `run` has left, and move their recordings to the data. Raises OSError."""
+        end_everything(self._shared.state, LEFT_SECONDS)
+        for project_id in self._shared.projects:
+            self._shared.rescue(project_id)
+        for note in (self._shared.state / "tasks").iterdir():
+            note.unlink()
+        logs = [path for path in (self._shared.state / "logs").glob("*.log") if path.name != "functions.log"]
+        for log in sorted(logs, key=lambda path: path.stat().st_mtime, reverse=True)[KEPT_LOGS:]:
+            log.unlink(missing_ok=True)
 
     def close(self, seconds: float = 5.0) -> None:
         """End every server: SIGTERM now, and SIGKILL after `seconds`. Return when all are gone.
@@ -194,44 +142,44 @@ class ProcessTasks:
         """
         with self._lock:
             self._closing = True
-            running = [server for server in self._all() if server.task.status != "STOPPED"]
-        until = time.monotonic() + seconds
-        for server in running:
-            server.end("local mode was ended", until, even_unsaved=True)
-        for server in running:
-            server.gone.wait(max(0.0, until - time.monotonic()))
-        for server in running:
-            if not server.gone.is_set():
-                server.kill_at_once()
-        until = time.monotonic() + KILLED_SECONDS
-        for server in running:
-            server.gone.wait(max(0.0, until - time.monotonic()))
+        _end([server for server in self._all() if not server.over], "local mode was ended", seconds)
         self._shared.closed.set()
 
     def forget(self, names: Sequence[str] | None = None) -> int:
-        """End these servers (None: all) at once and remove their files; return how many were running.
+        """End these servers (None: all) at once and remove their logs; return how many were running.
 
         For servers whose records were deleted: nothing else stops them, and new servers may get their names.
         """
-        forgotten = [server for server in self._all() if names is None or server.task.name in names]
-        playing = [server for server in forgotten if server.task.status != "STOPPED"]
+        forgotten = [server for server in self._all() if names is None or server.name in names]
+        playing = [server for server in forgotten if not server.over]
         for server in playing:
             server.silent = True
-            server.end("its record is gone", time.monotonic(), even_unsaved=True)
-        for server in playing:
-            server.gone.wait(5)
+        _end(playing, "its record is gone", 0)
         for server in forgotten:
-            self._forget(server)
-            self.log(server.task.name).unlink(missing_ok=True)
+            with self._lock:
+                self._servers.pop(server.name, None)
+            self.log(server.name).unlink(missing_ok=True)
         return len(playing)
 
-    def playing(self) -> Sequence[TaskRecord]:
-        """Return the servers that have not stopped. A warm server's `folder` is empty until it is assigned."""
-        playing = [server for server in self._all() if server.task.status != "STOPPED"]
+    def playing(self) -> Sequence[TaskProcess]:
+        """Return the servers that have not ended. A warm server's `folder` is empty until it is assigned."""
+        playing = [server for server in self._all() if not server.over]
         for server in playing:
             with contextlib.suppress(OSError):  # the next look sees it
                 server.read_handover()
-        return [server.task for server in playing]
+        return playing
+
+    def port_of(self, label: str) -> int | None:
+        """Return the port of the newest server that has this label in its DNS name; None if there is none.
+
+        The label is the server's name, or its participant's id in lower case.
+        """
+        ports = [
+            server.port
+            for server in self._all()
+            if server.lives and server.port and label in (server.name, server.folder.rpartition("/")[2].lower())
+        ]
+        return ports[-1] if ports else None
 
     def log(self, name: str) -> Path:
         """Return the log file of the server of this name."""
@@ -241,25 +189,15 @@ class ProcessTasks:
         with self._lock:
             return [*self._servers.values()]
 
-    def _forget(self, server: TaskProcess) -> None:
-        with self._lock:
-            if self._servers.get(server.task.name) is server:
-                del self._servers[server.task.name]
-            server.forget()
 
-    def _load(self) -> None:
-        """Read the records that an earlier process left. Raises OSError."""
-        for task in self._files.load():
-            server = self._servers[task.name] = TaskProcess(task, self._shared)
-            if task.status == "STOPPED":
-                server.gone.set()
-
-    def _prune(self) -> None:
-        """Remove the records and logs of stopped servers, except for the newest. Raises OSError."""
-        stopped = [server for server in self._all() if server.task.status == "STOPPED"]
-        stopped.sort(key=lambda server: server.task.stopped or "", reverse=True)
-        for server in stopped[KEPT_LOGS:]:
-            self.log(server.task.name).unlink(missing_ok=True)
-        for server in stopped[KEPT_TASKS:]:
-            if not server.unfinished:
-                self._forget(server)
+def _end(servers: Sequence[TaskProcess], reason: str, seconds: float) -> None:
+    """End these servers, with SIGKILL after `seconds`, and wait until they are gone."""
+    for server in servers:
+        server.end(reason, seconds)
+    until = time.monotonic() + seconds
+    for server in servers:
+        if not server.gone.wait(max(0.0, until - time.monotonic())):
+            server.kill()
+    until = time.monotonic() + KILLED_SECONDS
+    for server in servers:
+        server.gone.wait(max(0.0, until - time.monotonic()))

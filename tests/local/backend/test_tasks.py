@@ -1,4 +1,4 @@
-"""Servers as processes: their events, and that none is lost or left over at whatever moment this process is killed."""
+"""Servers as processes: their events, and that none is left over at whatever moment this process is killed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -22,7 +21,6 @@ from hippodrome.control.ports import Address, Refused, TaskRequest
 from hippodrome.local.backend import task_process
 from hippodrome.local.backend import tasks as tasks_module
 from hippodrome.local.backend.processes import end_everything, marked
-from hippodrome.local.backend.task_record import TaskFolder, TaskRecord
 from hippodrome.local.backend.tasks import ProcessTasks
 from hippodrome.protocol.handover import Handover
 from hippodrome.trial.gym import linux
@@ -79,21 +77,6 @@ class Here:
     def log(self, name: str = NAME) -> str:
         return (self.state / "logs" / f"{name}.log").read_text()
 
-    def written(self) -> None:
-        """Wait until all that was told is written down: an event is sent before its version is saved."""
-        until(lambda: all(map(self._is_written, self.events)))
-
-    def _is_written(self, event: dict[str, Any]) -> bool:
-        file = self.state / "tasks" / f"{event['detail']['startedBy']}.json"
-        return bool(json.loads(file.read_text())["version"] >= event["detail"]["version"])
-
-    def forget(self) -> None:
-        """What a `kill -9` of this process would make of it: nobody looks after the servers any more."""
-        self.written()
-        for server in (server for tasks in self.made for server in tasks._all()):
-            server._rescue = lambda: threading.Event().wait()  # type: ignore[assignment, method-assign, return-value]
-        self.events.clear()
-
 
 @pytest.fixture
 def here(tmp_path: Path) -> Iterator[Here]:
@@ -121,13 +104,11 @@ def test_a_server_that_runs_and_is_stopped_has_the_events_of_ecs(here: Here) -> 
     assert stopped["stoppedReason"] == "hippodrome: enough"
     assert stopped["containers"][0]["exitCode"] == 0
     assert stopped["desiredStatus"] == "STOPPED"
-    assert [event["detail"]["lastStatus"] for event in here.events] == ["PROVISIONING", "RUNNING", "STOPPED"]
-    assert [event["detail"]["version"] for event in here.events] == [1, 2, 3]
+    assert [event["detail"]["lastStatus"] for event in here.events] == ["RUNNING", "STOPPED"]
     assert here.processes() == []
     assert tasks.addresses([interface]) == {}
     read = [messages.parse_task_changed(json.loads(json.dumps(event))) for event in here.events]
     assert [(found.status, found.interface, found.cluster) for found in read if found] == [
-        ("PROVISIONING", interface, "hippodrome"),
         ("RUNNING", interface, "hippodrome"),
         ("STOPPED", interface, "hippodrome"),
     ]
@@ -144,7 +125,7 @@ def test_a_server_gets_its_environment(here: Here, monkeypatch: pytest.MonkeyPat
         "AGENT_DIR": str(here.project),
         "TOKEN": "secret",
     }
-    server = next(p for p in marked(here.state)[NAME] if "fake_trial.py" in " ".join(p.cmdline()[1:4]))
+    [server] = marked(here.state)[NAME]
     assert "AWS_SECRET_ACCESS_KEY" not in server.environ()
     assert server.cwd() == str(here.project)
     assert "secret" not in (here.state / "tasks" / f"{NAME}.json").read_text()
@@ -228,137 +209,56 @@ def test_child_processes_of_a_server_end_with_it(here: Here, tmp_path: Path) -> 
     until(lambda: not linux.runs(child))
 
 
-def test_the_next_process_takes_over_running_servers(here: Here) -> None:
-    arn = here.tasks().run(request())
-    here.wait("RUNNING")
-    here.forget()
-    tasks = here.tasks()
-    tasks.start()
-    assert tasks.find(NAME, "hippodrome") == arn
-    assert tasks.run(request()) == arn
-    time.sleep(0.2)
-    assert here.events == [], "nothing changed"
-    tasks.stop(arn, "hippodrome", "hippodrome: enough")
-    assert here.wait("STOPPED")["stopCode"] == "UserInitiated"
-    assert here.processes() == []
+def left_by_a_killed_run(here: Here, **environment: str) -> None:
+    """Begin a server in another process, which is killed."""
+    arguments = [here.state, here.data, here.project, json.dumps(environment)]
+    assert subprocess.run([sys.executable, "-c", BEGIN, *map(str, arguments)], cwd=ROOT, check=False).returncode < 0
+    until(here.processes)
 
 
 BEGIN = """
-import os, signal, sys
+import json, os, signal, sys
 from pathlib import Path
-from hippodrome.local.backend.task_process import TaskProcess
 from hippodrome.local.backend.tasks import ProcessTasks
 from tests.local.backend.test_tasks import FAKE, request
-from hippodrome.protocol.handover import Handover
-state, data, project, moment, seconds = sys.argv[1:]
-
-def die():
-    os.kill(os.getpid(), signal.SIGKILL)
-
-tasks = ProcessTasks(Path(state), Path(data), Path(project), lambda event: None, command=FAKE)
-spawn = TaskProcess._spawn
-if moment == "before":
-    TaskProcess._spawn = lambda self, request: die()
-elif moment == "after":
-    TaskProcess._spawn = lambda self, request: (spawn(self, request), die())
-tasks.run(request(FAKE_SECONDS=seconds))
-die()
+state, data, project = map(Path, sys.argv[1:4])
+tasks = ProcessTasks(state, data, project, lambda event: None, command=FAKE)
+tasks.run(request(**json.loads(sys.argv[4])))
+os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def _begin_and_be_killed(here: Here, moment: str, seconds: float = 60) -> None:
-    arguments = [here.state, here.data, here.project, moment, seconds]
-    command = [sys.executable, "-c", BEGIN, *map(str, arguments)]
-    assert subprocess.run(command, cwd=ROOT, check=False).returncode == -signal.SIGKILL
-    if moment != "before":  # no process could write it in that case
-        until((here.state / "tasks" / f"{NAME}.pid").exists)
-
-
-def test_after_a_kill_before_the_server_started_the_task_can_be_requested_again(here: Here) -> None:
-    _begin_and_be_killed(here, "before")
+@pytest.mark.parametrize("environment", [{}, {"FAKE_STUBBORN": "yes"}], ids=["", "ignores SIGTERM"])
+def test_servers_that_a_killed_run_has_left_are_ended(
+    here: Here, monkeypatch: pytest.MonkeyPatch, environment: dict[str, str]
+) -> None:
+    monkeypatch.setattr(tasks_module, "LEFT_SECONDS", 1)
+    left_by_a_killed_run(here, **environment)
     tasks = here.tasks()
-    tasks.start()
-    assert list(tasks.list()) == []
+    tasks.clear()
+    assert here.processes() == []
     tasks.run(request())
     here.wait("RUNNING")
     assert len(marked(here.state)) == 1
 
 
-@pytest.mark.parametrize("moment", ["after", "end"])
-def test_after_a_kill_the_started_server_is_found(here: Here, moment: str) -> None:
-    _begin_and_be_killed(here, moment)
-    before = marked(here.state)[NAME]
+@pytest.mark.parametrize("kept", [True, False])
+def test_recordings_that_a_killed_run_has_left_are_kept_if_the_study_keeps_any(here: Here, kept: bool) -> None:
     tasks = here.tasks()
-    tasks.start()
+    tasks.add_project("study", here.project, keeps_recordings=kept)
+    half_a_game(here)
+    tasks.clear()
+    assert (here.data / PLAYED / "3-trial.jsonl.gz").exists() is kept
+
+
+def test_a_running_server_names_its_owner_and_its_process_for_erase(here: Here) -> None:
+    tasks = here.tasks()
     arn = tasks.run(request())
-    assert here.wait("RUNNING")["taskArn"] == arn
-    assert {p.pid for p in marked(here.state)[NAME]} >= {p.pid for p in before}
+    here.wait("RUNNING")
+    note = here.state / "tasks" / f"{NAME}.json"
+    assert json.loads(note.read_text()) == {"folder": "study/users/P1", "pid": marked(here.state)[NAME][0].pid}
     tasks.stop(arn, "hippodrome", "hippodrome: enough")
-    here.wait("STOPPED")
-    assert here.processes() == []
-
-
-@pytest.mark.parametrize("moment", ["after", "end"])
-def test_servers_that_ended_between_two_processes_are_reported_with_their_exit_code(here: Here, moment: str) -> None:
-    _begin_and_be_killed(here, moment, seconds=0.2)
-    until(lambda: not here.processes())
-    here.tasks().start()
-    assert here.wait("STOPPED")["containers"][0]["exitCode"] == 0
-
-
-def test_after_a_kill_the_stop_of_a_server_is_finished(here: Here) -> None:
-    first = here.tasks()
-    arn = first.run(request())
-    here.wait("RUNNING")
-    os.kill(next(p.pid for p in marked(here.state)[NAME] if "-c" not in p.cmdline()[:2]), signal.SIGSTOP)
-    first.stop(arn, "hippodrome", "hippodrome: enough")
-    here.forget()
-    here.tasks(stop_timeout=0.5).start()
-    stopped = here.wait("STOPPED")
-    assert stopped["stoppedReason"] == "hippodrome: enough"
-    until(lambda: not here.processes())
-
-
-def test_an_event_that_may_not_have_been_sent_is_sent_again(here: Here) -> None:
-    tasks = here.tasks()
-    tasks.run(request(FAKE_SECONDS="0.2"))
-    here.wait("STOPPED")
-    tasks.close()
-    here.forget()
-    file = here.state / "tasks" / f"{NAME}.json"
-    kept = json.loads(file.read_text())
-    file.write_text(json.dumps({**kept, "status": "RUNNING", "version": 2, "stopped": None}))  # killed before the write
-    file.with_suffix(".exit").write_text("0\n")
-    here.tasks().start()
-    assert here.wait("STOPPED")["version"] == 3
-
-
-def test_a_process_id_that_another_program_has_now_is_left_alone(here: Here) -> None:
-    """After a restart of the machine, the record says that the server runs, but another program has its process id."""
-    bystander = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
-    try:
-        tasks = here.tasks()
-        task = TaskRecord(
-            NAME, "hippodrome", "0" * 32, "2026-11-21T00:00:00.000Z", pid=bystander.pid, port=1, version=2
-        )
-        TaskFolder(here.state / "tasks").save(replace(task, status="RUNNING"))
-        tasks = here.tasks()
-        tasks.start()
-        assert here.wait("STOPPED")["stopCode"] == "EssentialContainerExited"
-        tasks.close(0.5)
-        assert bystander.poll() is None
-    finally:
-        bystander.kill()
-        bystander.wait()
-
-
-def test_unknown_server_processes_are_ended(here: Here) -> None:
-    here.tasks().run(request())
-    here.wait("RUNNING")
-    here.written()
-    (here.state / "tasks" / f"{NAME}.json").unlink()
-    here.tasks().start()
-    until(lambda: not here.processes())
+    until(lambda: not note.exists())
 
 
 def test_a_recording_of_a_killed_server_is_kept(here: Here) -> None:
@@ -404,7 +304,8 @@ def test_a_shells_variable_GROUP_is_no_participants_group(here: Here, monkeypatc
 def test_a_recording_is_not_kept_if_the_study_keeps_none(here: Here) -> None:
     folder = f"study/users/P1/trials/{NAME}"
     tasks = here.tasks(stop_timeout=0.2)
-    arn = tasks.run(request(FAKE_STUBBORN="yes", TRIAL='{"s3upload": false}'))
+    tasks.add_project("study", here.project, keeps_recordings=False)
+    arn = tasks.run(request(FAKE_STUBBORN="yes"))
     here.wait("RUNNING")
     (here.state / "spool" / folder).mkdir(parents=True)
     (here.state / "spool" / folder / "3-trial.jsonl.gz.part").write_bytes(b"half a game")
@@ -440,8 +341,8 @@ def half_a_game(here: Here) -> None:
 
 def kill(here: Here) -> None:
     """Kill the server's own process, as the kernel does when memory runs out."""
-    pid = int((here.state / "tasks" / f"{NAME}.pid").read_text())
-    os.kill(pid, signal.SIGKILL)
+    [server] = marked(here.state)[NAME]
+    os.kill(server.pid, signal.SIGKILL)
 
 
 def test_a_recording_of_a_killed_warm_server_is_kept_where_its_participants_are(here: Here) -> None:
@@ -472,28 +373,6 @@ def test_the_document_of_a_warm_server_may_be_deleted_before_its_process_ends(he
     document.unlink()  # the control plane deletes it after the stop
     here.wait("STOPPED")
     assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
-
-
-def test_the_next_process_knows_the_participant_of_a_warm_server(here: Here) -> None:
-    first = here.tasks()
-    first.run(warm_server_request())
-    here.wait("RUNNING")
-    document = give(here)
-    assert [task.folder for task in first.playing()] == ["study/users/P1"]
-    document.unlink()
-    half_a_game(here)
-    here.forget()
-    here.tasks().start()
-    kill(here)
-    here.wait("STOPPED")
-    assert (here.data / PLAYED / "3-trial.jsonl.gz").read_bytes() == b"half a game"
-
-
-def test_a_warm_servers_record_names_its_handover_as_earlier_versions_did(tmp_path: Path) -> None:
-    folder, task = TaskFolder(tmp_path), TaskRecord.of(warm_server_request(), "0" * 32)
-    folder.save(task)
-    assert json.loads(folder.file(NAME).read_bytes())["warm_server"] == f"study/handovers/{NAME}.json"
-    assert list(folder.load()) == [task]
 
 
 @pytest.mark.parametrize("document", [None, b"", b'{"userId": "P1", "ser', b'{"userId": "../P1", "server": "a-1"}'])
@@ -569,13 +448,11 @@ def test_close_ends_all_servers_and_starts_none(here: Here) -> None:
 
 def test_old_logs_are_deleted(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tasks_module, "KEPT_LOGS", 2)
-    monkeypatch.setattr(tasks_module, "KEPT_TASKS", 3)
     tasks = here.tasks()
     names = [f"s{'a' * 20}-{n}" for n in range(1, 6)]
     for name in names:
         tasks.run(request(name, FAKE_SECONDS="0"))
         here.wait("STOPPED", name)
     tasks.close()
-    here.tasks().start()
+    here.tasks().clear()
     assert sorted(path.stem for path in (here.state / "logs").iterdir()) == names[3:]
-    assert sorted(path.stem for path in (here.state / "tasks").glob("*.json")) == names[2:]
