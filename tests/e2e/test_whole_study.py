@@ -91,8 +91,8 @@ def test_local_mode_is_killed_and_started_again(project: Any, hold: Any, free_po
 
     asyncio.run(with_bots([player], crash()))
     found = looked_at(study, [player.report, reader.report])
-    assert (found.recordings, found.steps) == (2, 480)
-    assert len(player.report.plays[0].addresses) == 1  # went on where they were
+    assert (found.recordings, found.steps) == (3, 480)
+    assert len(player.report.plays[0].addresses) == 2  # went on where they were, on another server
     assert wait_until_gone(study.data).words() == []
 
 
