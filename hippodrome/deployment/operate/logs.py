@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import heapq
 import json
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any
 
@@ -17,6 +19,7 @@ from rich.text import Text
 from hippodrome.console import screen
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.aws import errors as aws_errors
+from hippodrome.control.model import ids
 from hippodrome.deployment.aws import resource_names
 from hippodrome.deployment.aws.account import find_installation, open_account
 from hippodrome.deployment.aws.resource_names import STACK
@@ -24,11 +27,131 @@ from hippodrome.deployment.code.template import Template
 from hippodrome.deployment.core import options, participants
 from hippodrome.deployment.core.server_records import Records
 from hippodrome.deployment.core.study_selection import one_or_all
-from hippodrome.deployment.operate.log_lines import TRIAL, LogLine, moment, read
 
+TRIAL = "trial"  # the log group of the servers
 POLL = 5  # seconds between two looks; an account may call FilterLogEvents 5 times a second in most regions
 OVERLAP = timedelta(seconds=60)  # events may arrive this late, so each look goes back so far
+ERRORS = {"ERROR", "CRITICAL", "FATAL"}
 STYLES = {"ERROR": "red", "CRITICAL": "bold red", "WARNING": "yellow", "DEBUG": "dim"}
+
+_UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
+_AGO = re.compile(r"(\d{1,4})\s*([smhdw])")
+_PLATFORM_TEXT = re.compile(r"(INIT_START|START|END|REPORT)\b")
+_FATAL_TEXT = re.compile(
+    r"Task timed out after|Runtime exited|Process exited before|\[ERROR\]|Runtime\.\w+Error|\bstatus: (error|timeout)",
+    re.IGNORECASE,
+)
+# The beginning of a line of `logging` or of Lambda's text format, and the message after it.
+_TEXT = re.compile(
+    r"(?:\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d\S*\s+)?\[?(DEBUG|INFO|WARNING|WARN|ERROR|CRITICAL|FATAL)\]?[\s:]+(.*)",
+    re.DOTALL,
+)
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+_OF_EVERY_LINE = {"level", "message", "timestamp", "service", "location", "function_name", "function_arn", "cold_start"}
+_LEFT_OUT = _OF_EVERY_LINE | {"function_memory_size", "function_request_id", "xray_trace_id", "_aws"}
+
+
+@dataclass(frozen=True)
+class LogLine:
+    """A log event: its time, its source (a function, or `trial`), its level, its message and further fields."""
+
+    time: datetime
+    source: str
+    level: str  # "" if the event has none
+    message: str
+    fields: Mapping[str, Any] = field(default_factory=dict)
+    platform: bool = False  # Lambda's own START, END and REPORT without an error, or metrics
+    stream: str = ""
+
+    @property
+    def is_error(self) -> bool:
+        return self.level in ERRORS
+
+    @property
+    def server(self) -> str | None:
+        """The label of the server that the line is about, if it names one."""
+        for name in (self.fields.get("server"), self.fields.get("name")):
+            parsed = ids.parse_server_name(name) if isinstance(name, str) else None
+            if parsed:
+                return parsed[0]
+        return None
+
+    def as_text(self) -> str:
+        """Write the line for a terminal, in local time."""
+        more = _printable(" ".join(f"{name}={_short(value)}" for name, value in self.fields.items()))
+        level = f"{self.level:<7} " if self.level else ""
+        message = _printable(self.message.rstrip("\n")).replace("\n", "\n    ")
+        return f"{self.time.astimezone():%m-%d %H:%M:%S} {self.source:<14} {level}{message}{'  ' if more else ''}{more}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the line as JSON data, for scripts."""
+        return {
+            "time": self.time.isoformat(),
+            "source": self.source,
+            "level": self.level,
+            "message": self.message,
+            **({"fields": dict(self.fields)} if self.fields else {}),
+        }
+
+
+def read(event: Mapping[str, Any], source: str) -> LogLine:
+    """Read an event from FilterLogEvents, in any format that Hippodrome's log groups contain."""
+    time = datetime.fromtimestamp(int(event["timestamp"]) / 1000, UTC)
+    text = str(event.get("message", ""))
+    stream = str(event.get("logStreamName", ""))
+    try:
+        entry = json.loads(text)
+    except (ValueError, RecursionError):
+        entry = None
+    if isinstance(entry, dict):
+        return _of_json(entry, time, source, stream)
+    return _of_text(text, time, source, stream)
+
+
+def _of_json(entry: dict[str, Any], time: datetime, source: str, stream: str) -> LogLine:
+    if "routeKey" in entry or "httpMethod" in entry:  # an access log of the HTTP API
+        status = str(entry.get("status", ""))
+        level = "ERROR" if status.startswith("5") else "INFO"
+        method = entry.get("httpMethod") or entry.get("routeKey")
+        rest = {key: value for key, value in entry.items() if key not in ("httpMethod", "routeKey", "status")}
+        return LogLine(time, source, level, f"{status} {method}", rest, stream=stream)
+    fields = {key: value for key, value in entry.items() if key not in _LEFT_OUT and value is not None}
+    if "_aws" in entry and "message" not in entry:  # metrics (CloudWatch's embedded metric format)
+        return LogLine(time, source, "", "metrics", fields, platform=True, stream=stream)
+    message = entry.get("message", "")
+    text = message if isinstance(message, str) else json.dumps(message, ensure_ascii=False)
+    return LogLine(time, source, str(entry.get("level", "")).upper(), text, fields, stream=stream)
+
+
+def _of_text(text: str, time: datetime, source: str, stream: str) -> LogLine:
+    if _FATAL_TEXT.search(text):
+        return LogLine(time, source, "ERROR", text.strip(), stream=stream)
+    if _PLATFORM_TEXT.match(text) and source != TRIAL:
+        return LogLine(time, source, "", text.strip(), platform=True, stream=stream)
+    match = _TEXT.match(text)
+    if match:
+        level = {"WARN": "WARNING", "FATAL": "CRITICAL"}.get(match[1], match[1])
+        return LogLine(time, source, level, match[2].rstrip("\n"), stream=stream)
+    return LogLine(time, source, "", text.rstrip("\n"), stream=stream)
+
+
+def moment(text: str, now: datetime) -> datetime:
+    """Read `--since`: `90m` ago, or an ISO date or time, in UTC if it has no zone. Raises ValueError."""
+    if ago := _AGO.fullmatch(text.strip()):
+        return now - timedelta(**{_UNITS[ago[2]]: int(ago[1])})
+    parsed = datetime.fromisoformat(text.strip())
+    return parsed if parsed.tzinfo else parsed.replace(tzinfo=UTC)
+
+
+def _printable(text: str) -> str:
+    """Replace control characters in the text by �."""
+    return _CONTROL.sub("�", text)
+
+
+def _short(value: object) -> str:
+    if isinstance(value, str) and re.fullmatch(r"[\w.:/@+-]+", value):
+        return value
+    return json.dumps(value, ensure_ascii=False, default=str)
 
 
 class Reader:
@@ -66,7 +189,7 @@ class Reader:
         """
         streams = [self._events(source, since, project_id) for source in sources]
         for _, _, event, source in heapq.merge(*streams, key=lambda stream: stream[:2]):
-            yield f"{source}/{_id_of(event)}", read(event, source)
+            yield f"{source}/{event.get('eventId')}", read(event, source)
 
     def _events(
         self, source: str, since: datetime, project_id: str | None
@@ -87,11 +210,6 @@ class Reader:
         except ClientError as error:
             if aws_errors.code(error) != "ResourceNotFoundException":  # deleted after it was listed
                 raise
-
-
-def _id_of(event: Mapping[str, Any]) -> str:
-    """Return the event's id: AWS's own, or its time, stream and message, since emulators give no ids."""
-    return str(event.get("eventId") or [event.get(key) for key in ("timestamp", "logStreamName", "message")])
 
 
 class LineFilter:
@@ -124,26 +242,19 @@ class LineFilter:
 
 
 def follow(
-    look: Callable[[datetime], Iterable[tuple[str, LogLine]]],
-    since: datetime,
-    show: Callable[[LogLine], None],
-    *,
-    sleep: Callable[[float], None] = time.sleep,
-    rounds: int | None = None,
+    look: Callable[[datetime], Iterable[tuple[str, LogLine]]], since: datetime, show: Callable[[LogLine], None]
 ) -> None:
-    """Call `show` with each new line once, also with late ones, until Ctrl-C or for `rounds` looks."""
+    """Call `show` with each new line once, also with late ones, until Ctrl-C."""
     seen: dict[str, datetime] = {}
     latest = since
-    while rounds is None or rounds > 0:
+    while True:
         for event_id, line in look(max(since, latest - OVERLAP)):
             if event_id not in seen:
                 seen[event_id] = line.time
                 latest = max(latest, line.time)
                 show(line)
         seen = {event_id: when for event_id, when in seen.items() if when >= latest - OVERLAP}
-        rounds = None if rounds is None else rounds - 1
-        if rounds != 0:
-            sleep(POLL)
+        time.sleep(POLL)
 
 
 def command(

@@ -13,7 +13,7 @@ import pytest
 from hippodrome.console.problem import Exit
 from hippodrome.deployment.aws import resource_names
 from hippodrome.deployment.operate import logs
-from hippodrome.deployment.operate.log_lines import moment, read
+from hippodrome.deployment.operate.logs import moment, read
 from testing import template as cfn
 from testing.studies import study
 from tests.deployment.installation import Installed, process
@@ -96,12 +96,6 @@ def test_logs_says_that_there_are_no_lines(installed: Installed, capsys: Any) ->
     assert installed.run(capsys, "logs", "--all").err == ""
 
 
-def test_events_without_ids_are_followed() -> None:
-    events = [{"timestamp": n, "logStreamName": "a", "message": "same"} for n in (1, 2)]
-    assert len({logs._id_of(event) for event in events}) == 2
-    assert logs._id_of({**events[0], "eventId": "e"}) == "e"
-
-
 def test_lines_of_more_than_a_page_are_all_shown(installed: Installed, capsys: Any) -> None:
     put_messages(installed, "next_step", *[log_message("INFO", f"line {n}") for n in range(10_500)], ago=600)
     ran = installed.run(capsys, "logs", "--all", "--function", "next_step", "--json")
@@ -122,23 +116,15 @@ def test_errors_can_be_shown_alone_with_the_tracebacks_of_trials(installed: Inst
     put_messages(
         installed, "sweep", "2026-11-21T10:00:00Z 1-2 Task timed out after 30.03 seconds", log_message("INFO", "swept")
     )
-    put_messages(installed, "stop_server", json.dumps({"errorType": "KeyError", "errorMessage": "'id-of-somebody'"}))
-    put_messages(
-        installed, "stop_server", json.dumps({"type": "platform.report", "record": {"status": "timeout"}}), stream="j"
-    )
-    put_messages(
-        installed, "stop_server", json.dumps({"type": "platform.report", "record": {"status": "success"}}), stream="k"
-    )
+    put_messages(installed, "stop_server", "[ERROR] Runtime.ImportModuleError: Unable to import module")
     ran = installed.run(capsys, "logs", "--all", "--errors", "--json")
     assert sorted(one["message"] for one in lines(ran)) == [
         "  KeyError",
         "2026-11-21T10:00:00Z 1-2 Task timed out after 30.03 seconds",
         "Traceback (most recent call last):",
-        "report: timeout",
+        "[ERROR] Runtime.ImportModuleError: Unable to import module",
         "the agent failed",
-        "unhandled exception",
     ]
-    assert "id-of-somebody" not in ran.out
 
 
 def test_the_lines_of_one_project_can_be_shown_alone(installed: Installed, capsys: Any) -> None:
@@ -194,7 +180,7 @@ def test_since_takes_spans_and_times(text: str, ago: timedelta) -> None:
     assert NOW - moment(text, NOW) == ago
 
 
-@pytest.mark.parametrize("text", ["", "h", "1y", "-1h", "999999w", "2026-13-01"])
+@pytest.mark.parametrize("text", ["", "h", "1y", "-1h", "99999w", "2026-13-01"])
 def test_other_values_of_since_are_refused(text: str) -> None:
     with pytest.raises(ValueError):
         moment(text, NOW)
@@ -208,7 +194,6 @@ def test_other_values_of_since_are_refused(text: str) -> None:
         "[" * 5000,
         "null",
         '{"level": 7, "message": {"a": 1}}',
-        '{"type": "platform.report", "record": 1}',
         "\x00\x1b[31m",
     ],
 )
@@ -218,23 +203,27 @@ def test_hostile_lines_hold_no_escape_sequences_and_become_valid_json(message: s
     json.dumps(line.as_json())
 
 
-def test_following_shows_each_event_once_including_late_ones(installed: Installed) -> None:
+def test_following_shows_each_event_once_including_late_ones(
+    installed: Installed, monkeypatch: pytest.MonkeyPatch
+) -> None:
     put_messages(installed, "sweep", log_message("INFO", "one"), ago=20)
     reader = logs.Reader(installed.client("logs"), "hippodrome")
-    more = iter([(log_message("INFO", "two"), 2.0), (log_message("INFO", "late"), 15.0)])
+    more = [(log_message("INFO", "two"), 2.0), (log_message("INFO", "late"), 15.0)]
     shown: list[str] = []
 
     def sleep(_: float) -> None:
-        for message, ago in [next(more)]:
-            put_messages(installed, "sweep", message, ago=ago)
+        if not more:
+            raise KeyboardInterrupt
+        message, ago = more.pop(0)
+        put_messages(installed, "sweep", message, ago=ago)
 
-    logs.follow(
-        lambda since: reader.events(["sweep"], since),
-        NOW - timedelta(hours=1),
-        lambda line: shown.append(line.message),
-        sleep=sleep,
-        rounds=3,
-    )
+    monkeypatch.setattr(logs.time, "sleep", sleep)
+    with pytest.raises(KeyboardInterrupt):
+        logs.follow(
+            lambda since: reader.events(["sweep"], since),
+            NOW - timedelta(hours=1),
+            lambda line: shown.append(line.message),
+        )
     assert shown == ["one", "two", "late"]
 
 
