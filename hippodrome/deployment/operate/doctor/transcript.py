@@ -96,15 +96,10 @@ class Transcript:
         return False
 
     @property
-    def untried(self) -> list[str]:
-        """The keys without a line."""
-        return [key for key in LINES if key not in {finding.check for finding in self.findings}]
-
-    @property
     def proven(self) -> list[str]:
         """The keys of proven results: all their lines are good."""
-        wrong = {finding.check for finding in self.findings if finding.mark is not Mark.GOOD}
-        return [key for key in LINES if key not in wrong and key not in self.untried]
+        marks = {key: {line.mark for line in self.findings if line.check == key} for key in LINES}
+        return [key for key in LINES if marks[key] == {Mark.GOOD}]
 
     def document(self, region: str, bots: int) -> dict[str, Any]:
         """Return the transcript as JSON data, for a file."""
