@@ -34,17 +34,16 @@ def starts_at_link(config: Config) -> bool:
     return bool(config.steps) and config.events.start_server_step == config.steps[0].key
 
 
-def without_a_key(config: Config, actions: Sequence[str] = (), taken: str | None = None) -> Remark | None:
+def without_a_key(config: Config) -> Remark | None:
     """Return a remark if the action that the game takes without a key is not known to do nothing.
 
     Without a key the trial takes `idleAction`, or the action `noop`, or the first action
-    (`hippodrome/trial/core/players.py`); `taken` is that action, if it is known. With `pace: turns` it takes none.
-    `actions` are the names of all actions, if config.yml does not have them.
+    (`hippodrome/trial/core/players.py`). With `pace: turns` it takes none.
     """
-    names = [name.strip().lower() for name in config.trial.action_space or actions]
+    names = [name.strip().lower() for name in config.trial.action_space]
     if config.trial.idle_action is not None or config.trial.pace == "turns" or not names or not config.game_steps:
         return None
-    taken = taken or ("noop" if "noop" in names else names[0])
+    taken = "noop" if "noop" in names else names[0]
     if taken in IDLE:
         return None
     idle = next((name for name in names if name in IDLE), None)

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from hippodrome.control.config import Config, Diagnostic, layout
 from hippodrome.control.config.step_files import StepFileError, open_folder
 from hippodrome.control.model.design import Section, Step, answers_read, own_steps
 from hippodrome.control.model.matching import MATCH
-from hippodrome.local.check import waiting
 from hippodrome.local.check.agent_report import AgentReport
 from hippodrome.local.check.earlier_answers import EarlierAnswers
 from hippodrome.local.inherited import inherited_environment
@@ -40,23 +38,19 @@ _SESSION = f"s.{'0' * 20}"
 
 
 def try_agent(
-    folder: Path,
-    config: Config,
-    seconds: float = SECONDS,
-    say: Callable[[str], None] = lambda line: None,
-    say_long: Callable[[str], None] = lambda line: None,
+    folder: Path, config: Config, seconds: float = SECONDS, say: Callable[[str], None] = lambda line: None
 ) -> list[Diagnostic]:
     """Let the agent play in each group (Hippodrome's agent, if the project has none), and return its problems.
 
     `say` gets a line for each group: how far the agent played. After a mistake in one group the others are not tried.
-    `say_long` gets a line for each call that takes long.
     """
     folder = folder.resolve()
     diagnostics: list[Diagnostic] = []
     for group in config.each_group:
         with tempfile.TemporaryDirectory(prefix="hippodrome-check-") as temporary:
             place = Path(temporary)
-            report, status = _try(folder, config, place, seconds, group, say_long=say_long)
+            status = _try(folder, config, place, seconds, group)
+            report = AgentReport(folder, config, place, seconds, group)
             diagnostics += [problem for problem in report.problems(status) if problem not in diagnostics]
             if report.played:
                 say(report.how_far())
@@ -65,47 +59,54 @@ def try_agent(
     return diagnostics
 
 
-def _try(
-    folder: Path, config: Config, place: Path, seconds: float, group: int | None, *, say_long: Callable[[str], None]
-) -> tuple[AgentReport, int | None]:
-    """Let the agent play in one group. Return its report and the exit status of its process."""
+def _try(folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> int | None:
+    """Let the agent play in one group. Return the exit status of its process, or None if it had to be killed."""
     environment = _environment(folder, config, place, seconds, group)
-    environment["PLAY_SECONDS"] = str(PLAY_SECONDS / len(config.each_group))
     stand_in = StandIn(always=True, env=environment)
     stand_in.use(config)
-    code = layout.agent_folder(folder).resolve()
-    report_now = partial(AgentReport, folder, config, place, seconds, group)
     try:
-        status = _run(place, environment, code, seconds + _STACK_SECONDS, lambda: say_long(report_now().still()))
+        with (
+            (place / "output").open("wb") as output,
+            process_group.started(
+                [sys.executable, "-P", "-m", "hippodrome.local.check.agent_process", str(place / "report")],
+                env=environment,
+                cwd=layout.agent_folder(folder).resolve(),
+                stdout=output,
+                stderr=subprocess.STDOUT,
+            ) as process,
+        ):
+            return process.wait(seconds + _STACK_SECONDS)
+    except subprocess.TimeoutExpired:
+        return None
     finally:
         stand_in.close()
-    return report_now(), status
 
 
 def _environment(folder: Path, config: Config, place: Path, seconds: float, group: int | None) -> dict[str, str]:
     """Environment variables as a trial server has them (`local/backend/task_process.py`, `trial/settings.py`)."""
     several = config.project.has_sessions
+    settings = {
+        "seconds": seconds,
+        "callSeconds": CALL_SECONDS,
+        "playSeconds": PLAY_SECONDS / len(config.each_group),
+        "games": _games(folder, config, group),
+        "match": _question(folder, config) if config.project.matching == MATCH and several else None,
+        "owner": None,
+    }
+    owner = {variables.USER_ID: "check", variables.GROUP: variables.group_text(group)}
     if config.project.warm_servers or several:  # a session's members are not known when its server starts
-        owner = {
-            variables.WARM_SERVER: "on",
-            "GIVEN": Handover(_SESSION if several else "check", group, "check").to_json().decode(),
-        }
-    else:
-        owner = {variables.USER_ID: "check", variables.GROUP: variables.group_text(group)}
-    question = {"MATCH": json.dumps(_question(folder, config))} if config.project.matching == MATCH and several else {}
+        owner = {variables.WARM_SERVER: "on"}
+        settings["owner"] = Handover(_SESSION if several else "check", group, "check").to_json().decode()
     return {
         **inherited_environment(),
         **owner,
-        **question,
         variables.PROJECT_ID: config.project.id,
         variables.SERVER: "check",
         variables.GAME_STEPS: ",".join(step.key for step in config.game_steps),
         variables.TRIAL: json.dumps(_trial(config)),
         variables.STORE: str(place),
         variables.AGENT_DIR: str(layout.agent_folder(folder).resolve()),
-        "GAMES": json.dumps(_games(folder, config, group)),
-        "SECONDS": str(seconds),
-        "CALL_SECONDS": str(CALL_SECONDS),
+        "SETTINGS": json.dumps(settings),
         "PYTHONDONTWRITEBYTECODE": "1",
     }
 
@@ -182,21 +183,3 @@ def _question(folder: Path, config: Config) -> dict[str, Any]:
             {"id": f"made-up-{number}", "waited": 5 * (3 * players - number), "group": group, "answers": answers}
         )
     return {"players": players, "waiting": waiting}
-
-
-def _run(
-    place: Path, environment: Mapping[str, str], folder: Path, seconds: float, long: Callable[[], None]
-) -> int | None:
-    """Run the agent's process; return its exit status, or None if it had to be killed."""
-    report = place / "report"
-    with (
-        (place / "output").open("wb") as output,
-        process_group.started(
-            [sys.executable, "-P", "-m", "hippodrome.local.check.agent_process", str(report)],
-            env=environment,
-            cwd=folder,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-        ) as process,
-    ):
-        return waiting.wait(process, seconds, report, long)

@@ -1,12 +1,10 @@
-"""The report of a tried agent: its process (`agent_process.py`) writes it, `agent_report.py` reads it."""
+"""What the process of a tried agent reports, as JSON, before it makes each call; `agent_report.py` reads it."""
 
 from __future__ import annotations
 
-import contextlib
-import io
+import faulthandler
 import json
 import math
-import os
 import sys
 import time
 import traceback
@@ -14,64 +12,65 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hippodrome.local.check.deadline import Deadline
-from hippodrome.local.check.pace import PLAY_STEPS, Pace
+from hippodrome.local.check.remedies import remedy
+from hippodrome.local.check.wording import short
+from hippodrome.protocol.values import printable
+from hippodrome.trial.agent import match
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.recorded_values import Values
 
-REPORT_BYTES = 2**20  # a report of this size begins anew
+PLAY_STEPS = 5_000  # the most steps in each group
 _LOOKED_AT = 1_000  # the most values, and elements of an array, in which objects that are kept as text are looked for
 
 
 class AgentProgress:
-    """Reports each method before it is called: if the process ends or hangs, the last line names the method.
+    """Reports each call before it is made: if the process ends or hangs in it, the report names it.
 
-    Each line holds all that is known. Two lines are appended to the file for each step: to write a new file for each
-    would take longer than a step of many environments.
+    When the time is over, the process ends, and `report.stack` says in which line each thread was.
     """
 
-    def __init__(
-        self,
-        report: Path,
-        folder: Path,
-        early: Sequence[tuple[str, str, int]] = (),
-        deadline: Deadline | None = None,
-    ) -> None:
-        """`early`: the project's lines that read the participant too early: variable, file, line. It may still grow.
+    def __init__(self, report: Path, folder: Path, settings: Mapping[str, Any], early: Sequence[Any] = ()) -> None:
+        """`folder` has agent.py.
 
-        `deadline` limits each call.
+        `settings`: the seconds for all calls together (`seconds`), for each that a server limits (`callSeconds`), and
+        of playing (`playSeconds`). `early`: lines that read the participant too early, as variable, file and line.
         """
-        self._deadline = deadline
         self._report, self._folder = report, folder
-        self._early = early
-        self._file: io.FileIO | None = None
-        self.episodes = self.steps = 0
-        self.matched: int | None = None
-        """How many sessions `match` made of made-up participants; None if it was not called."""
-        self.action: Any = 0  # the last action, or the last actions by player
-        self.known: dict[str, Any] = {}
-        self.foreign: list[int] = []
-        self.undrawn: list[str] = []
+        self._stack = report.with_suffix(".stack").open("w")
+        self._over_at, self._play_seconds = time.monotonic() + settings["seconds"], settings["playSeconds"]
+        self._limits = {"match": match.SECONDS, **dict.fromkeys(("reset", "step", "render"), settings["callSeconds"])}
+        self._played_at = math.inf
+        self._kinds: set[str] = set()  # the kinds of values on which a remark was made
+        self._problems: list[dict[str, Any]] = []
+        self.facts: dict[str, Any] = {
+            "episodes": 0,
+            "steps": 0,
+            "action": 0,
+            "early": early,
+            "problems": self._problems,
+        }
         self.callbacks: Any = None
-        self._callback_errors: list[dict[str, Any]] = []
-        self.pace = Pace()
         self.result: Any = None
+        """What the last call returned."""
         self._loaded_before = _installed_modules()
-        self._until = math.inf
+        report.touch()
+        self._end_after(settings["seconds"])
 
     def time_over(self) -> bool:
         """Return whether no more steps should be taken: there were enough, or the time of playing is over.
 
         The time counts from the end of the first step.
         """
-        if self.steps == 1 and self._until == math.inf:
-            self._until = time.monotonic() + float(os.environ.get("PLAY_SECONDS", "10"))
-        return self.steps >= PLAY_STEPS or time.monotonic() > self._until
+        if self.facts["steps"] == 1 and self._played_at == math.inf:
+            self._played_at = time.monotonic() + self._play_seconds
+        return self.facts["steps"] >= PLAY_STEPS or time.monotonic() > self._played_at
 
     def call(self, name: str, function: Callable[[], Any]) -> bool:
         """Report the name, call the function and keep its `result`. Return False if it raised, which is reported."""
-        within = self._deadline.begin(name) if self._deadline else None
-        self._write(call=name, within=within)
+        seconds_left = max(0.001, self._over_at - time.monotonic())  # faulthandler refuses 0
+        limit = self._limits.get(name, math.inf)
+        self._end_after(min(limit, seconds_left))
+        self._write(call=name, within=limit if limit < seconds_left else None)
         try:
             self.result = function()
         except BaseException as error:  # noqa: BLE001 - SystemExit in a researcher's code is a failure too
@@ -79,61 +78,67 @@ class AgentProgress:
             return False
         return True
 
+    def problem(self, place: str | tuple[Any, ...], message: str, *, remark: bool = True) -> None:
+        """Report a problem with which the game goes on, once.
+
+        `place` is a method of the agent, a file and its line, or the path of a key that begins with `trial`.
+        """
+        problem = {"place": place, "message": message, "remark": remark}
+        if problem not in self._problems:
+            self._problems.append(problem)
+
     def callback_failed(self, name: str, error: BaseException) -> None:
-        """Note that a callback of the agent has raised this error."""
-        self._callback_errors.append({"name": name, **_described(error, self._folder)})
+        """Report that a callback of the agent has raised this error."""
+        failure = _described(error, self._folder)
+        place = (failure["file"], failure["line"]) if failure["file"] else name
+        message = f"{name}() fails: {short(failure['text'])}{remedy(failure['type'], failure['text'])}"
+        self.problem(place, message, remark=False)
 
     def returned(
         self, observations: Iterable[Any], infos: Iterable[Mapping[str, Any]], extra: Mapping[str, Any] | None
     ) -> None:
-        """Note the first value of a step that is too large for the recording, and the first that is kept as text.
+        """Remark on the first value of a step that is too large for the recording, and the first that is kept as text.
 
         `extra` are the further values that `step` returned. `observations` are those that are recorded.
         """
-        values = (*(("info", info) for info in infos), ("what step() returns", extra or {}))
-        if "onlyText" not in self.known:
-            for where, value in (*(("an observation", observation) for observation in observations), *values):
-                reader = Values(most=_LOOKED_AT, longest=_LOOKED_AT)
-                reader.keep(value)
-                if reader.only_text:
-                    self.known["onlyText"] = {"type": reader.only_text[:100], "where": where}
-                    break
-        if "tooLarge" in self.known:
-            return
+        values = [*(("info", info) for info in infos), ("what step() returns", extra or {})]
+        for where, value in [*(("an observation", observation) for observation in observations), *values]:
+            reader = Values(most=_LOOKED_AT, longest=_LOOKED_AT)
+            reader.keep(value)
+            if reader.only_text and self._is_first("only text"):
+                message = (
+                    f"{where} has an object of the class {printable(reader.only_text[:100])}, of which only str() is "
+                    "recorded, at most 1000 characters; return numbers, texts, arrays, lists, dicts or dataclasses"
+                )
+                self.problem("step", message)
         for where, value in values:
             if where == "info" and not recording.is_too_large(value):
                 continue
             for name, size in recording.bounded_extra(value)[1].items():
-                self.known["tooLarge"] = {"name": name[:100], "size": size, "where": where}
-                return
+                if self._is_first("too large"):
+                    message = (
+                        f"{name[:100]!r} in {where} is too large for the recording ({size} bytes; all values of a step "
+                        "may have a megabyte as JSON): its size is recorded instead"
+                    )
+                    self.problem("step", message)
 
     def over(self) -> None:
         """Report that everything has been tried."""
         self._write(call="close", over=True, loaded=sorted(_installed_modules() - self._loaded_before))
 
-    def _write(self, **fields: Any) -> None:
-        progress_facts = {"episodes": self.episodes, "steps": self.steps, "action": self.action, "early": self._early}
-        progress_facts["pace"], progress_facts["matched"] = vars(self.pace), self.matched
-        if self.callbacks is not None:
-            progress_facts["callbacks"] = {"errors": self._callback_errors, "late": self.callbacks.first_late}
-        if self.undrawn:
-            progress_facts["undrawn"] = self.undrawn
-        self._append(
-            json.dumps({**progress_facts, **self.known, "foreign": bool(self.foreign), **fields}).encode() + b"\n"
-        )
+    def _is_first(self, kind: str) -> bool:
+        is_first = kind not in self._kinds
+        self._kinds.add(kind)
+        return is_first
 
-    def _append(self, line: bytes) -> None:
-        with contextlib.suppress(OSError):  # the agent has closed the file
-            if self._file is not None and self._file.tell() < REPORT_BYTES:
-                self._file.write(line)
-                return
-        if self._file is not None:
-            with contextlib.suppress(OSError):
-                self._file.close()
-        part = self._report.with_suffix(".part")
-        self._file = part.open("wb", buffering=0)
-        self._file.write(line)
-        part.replace(self._report)
+    def _end_after(self, seconds: float) -> None:
+        faulthandler.dump_traceback_later(seconds, exit=True, file=self._stack)
+
+    def _write(self, **facts: Any) -> None:
+        late = None if self.callbacks is None else self.callbacks.first_late
+        line = json.dumps({**self.facts, **facts, "late": late})
+        with self._report.open("r+b", buffering=0) as file:  # opened anew, since the agent may close all files
+            file.write(line.encode() + b"\n")  # over the last line: what follows the first line end is older
 
 
 def _installed_modules() -> set[str]:

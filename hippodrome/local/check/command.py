@@ -51,7 +51,7 @@ def command(
     if playable and config:
         sys.stdout.write(f"trying {label or config.trial.game} …\n")
         sys.stdout.flush()
-        tried = agent.try_agent(folder, config, seconds, _say, _say if sys.stdout.isatty() else lambda line: None)
+        tried = agent.try_agent(folder, config, seconds, _say)
         _print(tried)
         found += tried
     if config and (cost := model_cost.sentence(config)):

@@ -5,11 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-
 from hippodrome.local.backend.platform import LocalPlatform
-from hippodrome.local.check import agent_progress
-from hippodrome.local.check.agent_report import last_line
 from hippodrome.local.publish import publish
 from hippodrome.local.watch import Watch
 from tests.local.check.checking import agent, config, looked, page, run, tried
@@ -139,25 +135,6 @@ def test_a_server_for_every_opened_link_is_remarked_and_no_mistake(folder: Path)
     (line,) = looked(folder)
     assert line.startswith("config.yml:7: remark: project.events.startServerStep: every opened link starts a server")
     assert run(folder)[0] == 0
-
-
-def test_the_progress_of_an_agent_is_read_from_the_last_whole_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(agent_progress, "REPORT_BYTES", 1_000)
-    report = tmp_path / "report"
-    progress = agent_progress.AgentProgress(report, tmp_path)
-    sizes = []
-    for step in range(50):
-        progress.steps = step
-        assert progress.call("step", lambda: None)
-        told = last_line(report.read_text())
-        assert (told["call"], told["steps"]) == ("step", step)
-        sizes.append(report.stat().st_size)
-    assert 1_000 < max(sizes) < 2_000, "it begins anew"
-    with report.open("a") as file:
-        file.write('{"call": "rend')
-    assert last_line(report.read_text())["steps"] == 49
 
 
 def test_an_agent_that_closes_all_files_is_still_reported(folder: Path) -> None:

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from hippodrome.control.config import read_project
 from hippodrome.local.check import agent as agent_check
-from hippodrome.local.check import waiting
-from hippodrome.local.check.agent_report import AgentReport, slowness
-from hippodrome.local.check.pace import Pace
 from testing.exploration import sample
 from testing.waiting import until
 from tests.local.check.checking import agent, config, looked, page, run, tried
@@ -218,34 +213,13 @@ ENDLESS = (
         ([("maxEpisodes: 1", "maxEpisodes: 2\n  episodeSeconds: 9000")], False),
     ],
 )
-def test_episodes_that_never_end_are_remarked(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, changes: list[tuple[str, str]], remarked: bool
-) -> None:
-    monkeypatch.setattr(agent_check, "PLAY_SECONDS", 4.0)
+def test_episodes_that_never_end_are_remarked(folder: Path, changes: list[tuple[str, str]], remarked: bool) -> None:
     agent(folder, "self.n >= 30", "False")
-    config(folder, "startingFrameRate: 60", "startingFrameRate: 1")
     for old, new in changes:
         config(folder, old, new)
     found = tried(folder)
     assert len(found) == remarked
     assert all(re.fullmatch(ENDLESS, line) for line in found)
-
-
-@pytest.mark.parametrize(
-    ("told", "remarked"),
-    [
-        ({"steps": 3_599}, False),
-        ({"steps": 3_600}, True),  # two minutes of play
-        ({"steps": 9_000, "episodes": 1}, False),
-        ({"steps": 9_000, "over": False, "error": {"type": "E", "text": "", "file": "", "line": 0}}, False),
-    ],
-)
-def test_an_episode_that_was_not_played_for_long_may_end(folder: Path, told: dict[str, Any], remarked: bool) -> None:
-    config(folder, "maxEpisodes: 1", "maxEpisodes: 2")
-    config(folder, "startingFrameRate: 60", "startingFrameRate: 30")
-    (folder / "report").write_text(json.dumps({"over": True, "call": "step", "episodes": 0, **told}) + "\n")
-    report = AgentReport(folder, read_project(folder), folder, 60, None)
-    assert any("no episode ended" in str(problem) for problem in report.problems(0)) == remarked
 
 
 def test_a_method_that_is_named_like_a_callback_is_remarked_on(folder: Path) -> None:
@@ -388,33 +362,6 @@ def test_fields_of_a_page_that_the_game_page_shows_are_sent(folder: Path) -> Non
     assert any("nobody" in line for line in looked(folder))
 
 
-@pytest.mark.parametrize(
-    ("seconds", "slow"),
-    [
-        ([0.5] * 6, "2 steps a second"),
-        ([0.3] * 10, "3.3 steps a second"),
-        ([0.13] * 40, None),  # 7.7 of 15
-        ([0.5] * 4, None),  # too short to say
-        ([9.0, *[0.05] * 50], None),  # one step that has to load something
-        ([], None),
-    ],
-)
-def test_an_agent_is_slow_if_its_steps_take_too_long(seconds: list[float], slow: str | None) -> None:
-    pace = Pace()
-    for each in seconds:
-        pace.took(each)
-    said = slowness(pace, 15)
-    assert said == (None if slow is None else f"it plays {slow} here; startingFrameRate is 15")
-
-
-def test_an_agent_far_slower_than_the_frame_rate_is_remarked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    agent(folder, "self.n += 1", "import time; time.sleep(0.3); self.n += 1")
-    monkeypatch.setattr(agent_check, "PLAY_SECONDS", 3.0)
-    (line,) = tried(folder)
-    said = r"config\.yml:11: remark: trial\.startingFrameRate: it plays [\d.]+ steps a second here; .* is 60"
-    assert re.fullmatch(said, line)
-
-
 def with_a_third_name(folder: Path, step: str) -> None:
     """A study with three names, of which the environment has two; it complains of any other."""
     config(folder, "actionSpace: [noop, left]", "actionSpace: [noop, left, right]")
@@ -497,29 +444,6 @@ def test_calls_that_take_less_than_the_limit_may_take_longer_together(
     monkeypatch.setattr(agent_check, "PLAY_SECONDS", 4.0)
     agent(folder, "self.n += 1", "import time; time.sleep(0.9); self.n += 5")
     assert not [line for line in tried(folder) if "has not come back" in line]
-
-
-def test_a_call_that_takes_long_is_named_while_it_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(waiting, "LONG", 1.5)
-    agent(folder, "self.n += 1", "import time; self.n += 1; time.sleep(1000 if self.n == 3 else 0)")
-    said: list[str] = []
-
-    def interrupts(line: str) -> None:
-        said.append(line)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        agent_check.try_agent(folder, read_project(folder), 60, say_long=interrupts)
-    assert re.fullmatch(r"still in step\([01]\) …", said[0])
-
-
-def test_calls_that_come_back_soon_are_not_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(waiting, "LONG", 3.0)
-    monkeypatch.setattr(agent_check, "PLAY_SECONDS", 4.0)
-    agent(folder, "self.n += 1", "import time; time.sleep(0.4); self.n += 3")
-    said: list[str] = []
-    agent_check.try_agent(folder, read_project(folder), 60, say_long=said.append)
-    assert said == []
 
 
 def test_processes_of_the_agent_end_with_the_check(folder: Path, tmp_path: Path) -> None:

@@ -193,35 +193,6 @@ def test_each_group_is_tried_with_its_players(folder: Path) -> None:
     assert said == ["played in group 0: 3 of 3 episodes to the end, 60 steps"]
 
 
-SLOW = """    def act(self, observation, info):
-        import time  # its clock goes on by 50 ms: to sleep takes longer on a busy machine
-        time.clock = getattr(time, "clock", time.monotonic)
-        time.later = getattr(time, "later", 0.0) + 0.05
-        time.monotonic = lambda: time.clock() + time.later"""
-
-
-def test_a_policy_that_is_slower_than_a_step_is_remarked_with_its_time(folder: Path) -> None:
-    (folder / "agent.py").write_text(AGENT.replace("    def act(self, observation, info):", SLOW))
-    (line,) = tried(folder, "agent:Partner")
-    assert "remark: trial.players.right: agent:Partner needs 5" in line
-    assert "ms for an action here; at startingFrameRate 30 a step has 33.3 ms, and takes " in line
-    assert tried(folder, "agent:Partner", "maxEpisodes: 3", "maxEpisodes: 1\n  pace: turns") == []
-
-
-def test_players_who_take_turns_in_real_time_are_remarked(folder: Path) -> None:
-    agent = folder / "agent.py"
-    turn = '    def to_act(self):\n        return [["left", "right"][self.n % 2]]\n\n    def render'
-    agent.write_text(AGENT.replace("    def render", turn))
-    (line,) = tried(folder, "random")
-    assert line.endswith(
-        "trial.pace: realtime, but the players take turns: at 30 steps a second, a participant who presses nothing at "
-        "once takes the idle action; write pace: turns, unless that is meant"
-    )
-    assert tried(folder, "random", "maxEpisodes", "pace: turns\n  maxEpisodes") == []
-    agent.write_text(AGENT.replace("    def render", turn.replace('[["left", "right"][self.n % 2]]', '["left"]')))
-    assert tried(folder, "random") == [], "the same player acts at each step"
-
-
 def test_values_for_unknown_players_are_reported(folder: Path) -> None:
     (folder / "agent.py").write_text(AGENT.replace('{"left": 1}', '{"lift": 1}'))
     (line,) = tried(folder, "random")
@@ -264,67 +235,6 @@ def test_scenes_of_several_players_are_checked(folder: Path) -> None:
         "trial.scene: assets/cat.svg is no PNG, JPEG or WebP image; sprites show only these",
         "render(): the object 'b' shows the image 'cat', which is not in assets/",
     ]
-
-
-# ---- the action of no key
-
-ALONE_AGENT = """
-import numpy
-from gymnasium.spaces import Discrete
-
-
-class Env:
-    action_space = Discrete(4)
-
-
-class Agent:
-    def start(self, game):
-        self.env = Env()
-        return self.env
-    def reset(self, seed=None):
-        self.n = 0
-        return 0, {}
-    def step(self, action):
-        self.n += 1
-        return 0, 0, self.n == 200 or action == FATAL, False, {}
-    def render(self):
-        return numpy.zeros((8, 8, 3), numpy.uint8)
-    def close(self):
-        pass
-"""
-
-ALONE = "  actionSpace: [noop, up, down]\n  players: {left: human, right: PLAYS}\n"
-
-
-def without_a_key(folder: Path, more: str = "", fatal: int = 3) -> list[str]:
-    """The remarks on a game for one player in which action `fatal` ends the episode; `more` are lines of `trial`."""
-    (folder / "agent.py").write_text(ALONE_AGENT.replace("FATAL", str(fatal)))
-    return tried(folder, "", ALONE, more)
-
-
-def test_the_action_that_is_taken_without_a_key_is_named_if_nobody_says_that_it_does_nothing(folder: Path) -> None:
-    (line,) = without_a_key(folder)
-    assert line.endswith(
-        'remark: trial.actionSpace: while no key is pressed, the game takes "0", 30 times a second; if one of the '
-        "actions does nothing, name it as idleAction; if none does, write pace: turns, or see docs/agent.md#no-key"
-    )
-
-
-@pytest.mark.parametrize(
-    "more", ['  idleAction: "3"\n', '  idleAction: "0"\n', "  pace: turns\n", "  actionSpace: [stay, up, down, left]\n"]
-)
-def test_an_action_without_a_key_that_was_chosen_on_purpose_gets_no_remark(folder: Path, more: str) -> None:
-    assert without_a_key(folder, more, fatal=9) == []
-
-
-def test_an_episode_that_soon_ends_without_a_key_is_remarked(folder: Path) -> None:
-    *_, line = without_a_key(folder, fatal=0)
-    assert line.endswith(
-        "remark: trial.pace: realtime, and without a key an episode ends after 1 step (0.033 s); write pace: turns, unless "
-        "that is meant"
-    )
-    *_, line = without_a_key(folder, "  actionSpace: [stick, hit, up, down]\n", fatal=0)
-    assert "without a key an episode ends after 1 step" in line
 
 
 def test_callbacks_get_the_values_of_all_players(folder: Path) -> None:
