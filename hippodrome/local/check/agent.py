@@ -19,7 +19,7 @@ from hippodrome.control.config import Config, Diagnostic, layout
 from hippodrome.control.config.step_files import StepFileError, open_folder
 from hippodrome.control.model.design import Section, Step, answers_read, own_steps
 from hippodrome.control.model.matching import MATCH
-from hippodrome.local.check.agent_report import AgentReport
+from hippodrome.local.check.agent_report import PLAY_STEPS, AgentReport
 from hippodrome.local.check.earlier_answers import EarlierAnswers
 from hippodrome.local.inherited import inherited_environment
 from hippodrome.local.stand_in import StandIn
@@ -89,6 +89,7 @@ def _environment(folder: Path, config: Config, place: Path, seconds: float, grou
         "seconds": seconds,
         "callSeconds": CALL_SECONDS,
         "playSeconds": PLAY_SECONDS / len(config.each_group),
+        "playSteps": PLAY_STEPS,
         "games": _games(folder, config, group),
         "match": _question(folder, config) if config.project.matching == MATCH and several else None,
         "owner": None,

@@ -19,7 +19,6 @@ from hippodrome.trial.agent import match
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.recorded_values import Values
 
-PLAY_STEPS = 5_000  # the most steps in each group
 _LOOKED_AT = 1_000  # the most values, and elements of an array, in which objects that are kept as text are looked for
 
 
@@ -32,12 +31,14 @@ class AgentProgress:
     def __init__(self, report: Path, folder: Path, settings: Mapping[str, Any], early: Sequence[Any] = ()) -> None:
         """`folder` has agent.py.
 
-        `settings`: the seconds for all calls together (`seconds`), for each that a server limits (`callSeconds`), and
-        of playing (`playSeconds`). `early`: lines that read the participant too early, as variable, file and line.
+        `settings`: the seconds for all calls together (`seconds`), for each that a server limits (`callSeconds`) and of
+        playing (`playSeconds`), and the most steps (`playSteps`).
+
+        `early`: lines that read the participant too early, as variable, file and line.
         """
         self._report, self._folder = report, folder
         self._stack = report.with_suffix(".stack").open("w")
-        self._over_at, self._play_seconds = time.monotonic() + settings["seconds"], settings["playSeconds"]
+        self._over_at, self._settings = time.monotonic() + settings["seconds"], settings
         self._limits = {"match": match.SECONDS, **dict.fromkeys(("reset", "step", "render"), settings["callSeconds"])}
         self._played_at = math.inf
         self._kinds: set[str] = set()  # the kinds of values on which a remark was made
@@ -62,8 +63,8 @@ class AgentProgress:
         The time counts from the end of the first step.
         """
         if self.facts["steps"] == 1 and self._played_at == math.inf:
-            self._played_at = time.monotonic() + self._play_seconds
-        return self.facts["steps"] >= PLAY_STEPS or time.monotonic() > self._played_at
+            self._played_at = time.monotonic() + self._settings["playSeconds"]
+        return self.facts["steps"] >= self._settings["playSteps"] or time.monotonic() > self._played_at
 
     def call(self, name: str, function: Callable[[], Any]) -> bool:
         """Report the name, call the function and keep its `result`. Return False if it raised, which is reported."""

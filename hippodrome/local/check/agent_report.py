@@ -15,7 +15,6 @@ from hippodrome.control.config import Config, Diagnostic, agent_imports, layout,
 from hippodrome.control.config.folder import read_source
 from hippodrome.control.config.layout import AGENT
 from hippodrome.local.check.agent_file import label_of, line_of
-from hippodrome.local.check.agent_progress import PLAY_STEPS
 from hippodrome.local.check.remedies import remedy
 from hippodrome.local.check.wording import short
 from hippodrome.protocol import environment as variables
@@ -24,6 +23,9 @@ from hippodrome.protocol.trial import TALK
 from hippodrome.protocol.values import KeyPath, printable
 from hippodrome.trial.agent import environments
 from hippodrome.trial.core.messages import FEEDBACK
+
+PLAY_STEPS = 5_000
+"""The most steps that are played in each group."""
 
 _SIGNATURE = re.compile(r"(\w+)\(.*\) cannot be called; write ")
 _FRAME = re.compile(r'File "(?P<file>[^"]+)", line (?P<line>\d+)')
