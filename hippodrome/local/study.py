@@ -30,7 +30,8 @@ from hippodrome.local.watch import Watch
 from hippodrome.local.web.access import TLS_NAMES
 from hippodrome.local.web.app import App
 from hippodrome.local.web.names import PORT as NAMES_PORT
-from hippodrome.local.web.names import Names
+from hippodrome.local.web.names import names_server
+from hippodrome.local.web.relay import by_path
 from hippodrome.local.web.server import HOST, WebServer, address_of, listen
 
 OTHERS = 0o077  # the permissions of all users but the owner
@@ -104,11 +105,13 @@ class Study:
             own = own_cells.OwnCells(self._platform, FUNCTIONS["next_step"])
             functions = {**FUNCTIONS, "next_step": own.handler}
         app = App(functions, activity_log.warn, origins, any_name=host is not None)
-        find = self._platform.port_of_label if host else None
-        self.server = WebServer(app, listener, self._platform.retry.report, site, url=address, find=find)
-        self._names: Names | None = None
+        report = self._platform.retry.report
+        route = by_path(self._platform.port_of_label) if host else None
+        self.server = WebServer(app, listener, report, site, url=address, route=route)
+        self._names: WebServer | None = None
         if self._authority is not None and names_listener is not None:
-            self._names = Names(names_listener, self._authority, self._platform.port_of)
+            self._names = names_server(names_listener, self._authority, self._platform.port_of, report)
+        self._names_port = named_port
         self._watches = [self._watch(folder, config) for folder, config in self._configs.items()]
 
     def _watch(self, folder: Path, config: Config) -> Watch:
@@ -223,9 +226,9 @@ class Study:
         if self._names is None:
             shown = _TRUST.format(file=from_here(self._authority.certificate))
             return [Text(line) for line in shown.splitlines()]
-        shown = _TLS.format(port=self._names.port, file=from_here(self._authority.certificate))
+        shown = _TLS.format(port=self._names_port, file=from_here(self._authority.certificate))
         lines = [Text(line) for line in shown.splitlines()]
-        if self._names.port != NAMES_PORT:
+        if self._names_port != NAMES_PORT:
             text = f"  Port {NAMES_PORT} is in use; HIPPO's front end looks for servers there and nowhere else."
             lines.append(Text(text, "yellow"))
         return lines

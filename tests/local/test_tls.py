@@ -20,10 +20,11 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from hippodrome.local.backend import authority
 from hippodrome.local.backend.authority import Authority
 from hippodrome.local.web import app as web_app
-from hippodrome.local.web import connections, server
-from hippodrome.local.web.names import Names
+from hippodrome.local.web import server
+from hippodrome.local.web.names import names_server
 from testing.waiting import until
 from tests.local.conftest import Local
+from tests.local.web.test_relay import Game
 from tests.trial.hippo_page import HippoPage, hippo_page, new_user_id
 
 Make = Callable[..., Local]
@@ -261,76 +262,38 @@ def test_the_authoritys_certificate_has_critical_name_constraints(made: Authorit
 # ---- the port of all names
 
 
+HEAD = "GET /{path} HTTP/1.1\r\nHost: Game.localhost:5000\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\r\n"
+
+
 @pytest.fixture
-def echo(made: Authority) -> Iterator[tuple[int, ssl.SSLContext]]:
-    """The port of names with one server, which sends back what it gets."""
-    server = socket.create_server(("127.0.0.1", 0))
-    port = server.getsockname()[1]
-    listener = socket.create_server(("127.0.0.1", 0))
-    names = Names(listener, made, lambda name: port if name == "echo.localhost" else None)
-    names.start()
-
-    def serve() -> None:
-        try:
-            while True:
-                connection, _ = server.accept()
-                with connection:
-                    while data := connection.recv(65536):
-                        connection.sendall(data)
-        except OSError:
-            return
-
-    import threading
-
-    threading.Thread(target=serve, daemon=True).start()
-    yield names.port, ssl.create_default_context(cafile=made.certificate)
-    names.close()
-    server.close()
+def names(made: Authority) -> Iterator[tuple[int, ssl.SSLContext]]:
+    """The port of names with one server, `game`."""
+    game = Game()
+    find = {"game.localhost": game.port}.get
+    web = names_server(socket.create_server(("127.0.0.1", 0)), made, find)
+    web.start()
+    yield int(web.url.rpartition(":")[2]), ssl.create_default_context(cafile=made.certificate)
+    web.close()
+    game.close()
 
 
-def test_bytes_go_both_ways_and_the_end_of_one_side_ends_the_other(echo: tuple[int, ssl.SSLContext]) -> None:
-    port, trusted = echo
-    sent = bytes(range(256)) * 4000
-    for _ in range(3):
+def test_a_name_leads_to_its_server_and_the_path_stays(names: tuple[int, ssl.SSLContext]) -> None:
+    port, trusted = names
+    for path in ("", "gym?x=1"):
         with (
-            socket.create_connection(("127.0.0.1", port)) as plain,
-            trusted.wrap_socket(plain, server_hostname="Echo.localhost") as client,
+            socket.create_connection(("127.0.0.1", port), timeout=20) as plain,
+            trusted.wrap_socket(plain, server_hostname="Game.localhost") as client,
         ):
-            got = b""
-            for start in range(0, len(sent), 8192):
-                client.sendall(sent[start : start + 8192])
-                while len(got) < min(start + 8192, len(sent)):
-                    got += client.recv(65536)
-            assert got == sent
+            client.sendall(HEAD.format(path=path).encode())
+            assert client.recv(100) == b"hello"
+            client.sendall(b"there")
 
 
-def test_connections_without_tls_are_closed(echo: tuple[int, ssl.SSLContext]) -> None:
-    port, _ = echo
+def test_connections_without_tls_are_closed(names: tuple[int, ssl.SSLContext]) -> None:
+    port, _ = names
     with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
         client.sendall(b"GET / HTTP/1.1\r\n\r\n")
         assert re.fullmatch(rb"(\x15.*)?", client.recv(1024), re.DOTALL)
-
-
-def test_silent_connections_do_not_block_the_port_of_names(
-    echo: tuple[int, ssl.SSLContext], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    port, trusted = echo
-    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
-    silent = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(12)]
-    try:
-        with (
-            socket.create_connection(("127.0.0.1", port), timeout=20) as plain,
-            trusted.wrap_socket(plain, server_hostname="echo.localhost") as client,
-        ):
-            client.sendall(b"here")
-            assert client.recv(10) == b"here"
-            assert [each.recv(1) for each in silent[:5]] == [b""] * 5
-            silent[-1].setblocking(False)
-            with pytest.raises(BlockingIOError):
-                silent[-1].recv(1)
-    finally:
-        for each in silent:
-            each.close()
 
 
 @pytest.fixture
@@ -345,31 +308,14 @@ def site(made: Authority) -> Iterator[tuple[int, httpx.Client]]:
     web.close()
 
 
-def test_silent_connections_do_not_block_pages_with_tls(
-    site: tuple[int, httpx.Client], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silent_connections_do_not_block_pages_with_tls(site: tuple[int, httpx.Client]) -> None:
     port, client = site
-    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
-    silent = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(12)]
+    silent = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(200)]
     try:
         assert client.get("/healthz").status_code == 200
-        assert [each.recv(1) for each in silent[:5]] == [b""] * 5
-        silent[-1].setblocking(False)
-        with pytest.raises(BlockingIOError):
-            silent[-1].recv(1)
     finally:
         for each in silent:
             each.close()
-
-
-def test_a_silent_connection_is_closed_before_its_handshake(
-    site: tuple[int, httpx.Client], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    port, client = site
-    monkeypatch.setattr(connections, "HANDSHAKE_SECONDS", 0.3)
-    with socket.create_connection(("127.0.0.1", port), timeout=20) as silent:
-        assert silent.recv(1) == b""
-    assert client.get("/healthz").status_code == 200
 
 
 def test_the_authority_is_trusted_only_for_server_certificates(made: Authority) -> None:

@@ -11,7 +11,6 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 HEADER_SECONDS = 10.0  # from the connection, or the last response, until the headers of a request have come
 REQUEST_SECONDS = 60.0  # from the headers of a request until its body has come and its response is sent
-HANDSHAKE_SECONDS = 10.0  # from the connection until the end of the TLS handshake
 MAX_CONNECTIONS = 512  # connections at once
 ADDRESS_CONNECTIONS = 64  # connections at once for pages from one address of another machine
 LOOPBACK = "127."  # here all clients of this machine, such as bots and a proxy, have one address

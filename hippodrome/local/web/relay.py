@@ -1,7 +1,9 @@
-"""Connects browsers with the games of a lab's server, all at its one port: `/game/{name}/` leads to the server `name`.
+"""Connects browsers with games that share one port: a `Route` says which server a request is for.
 
-The servers of games listen on loopback addresses, where other machines cannot reach them. Bytes are copied as they are;
-so the game's server notices when its browser is slow or silent, and defends itself (`trial/server/listener.py`).
+In a lab it is the port of the pages, where `/game/{name}/` leads to the server `name`; on one machine with TLS it is
+the port of all names (`names.py`). The servers of games listen on loopback addresses, where other machines cannot reach
+them. Bytes are copied as they are; so the game's server notices when its browser is slow or silent, and defends itself
+(`trial/server/listener.py`).
 """
 
 from __future__ import annotations
@@ -13,23 +15,34 @@ from typing import Any
 
 from hippodrome.local.web import connections
 
-PATH = "/game/"
-_REQUEST = re.compile(rb"GET /game/([A-Za-z0-9-]{1,63})(/[!-~]*) (HTTP/1\.1)")
+_PATH = re.compile(r"/game/([A-Za-z0-9-]{1,63})(/.*)")
+_REQUEST = re.compile(rb"GET (/[!-~]*) HTTP/1\.1\r\n(.*)", re.DOTALL)
+_HOST = re.compile(rb"^host: *([^:\s]+)", re.IGNORECASE | re.MULTILINE)
 _PIECE = 16_384  # bytes that may wait here on each side
 _CONNECT_SECONDS = 5.0
 _CLOSE_SECONDS = 5.0  # in which a browser must take the last bytes
 
 Find = Callable[[str], int | None]
+Route = Callable[[str, str], tuple[int, str] | None]
+"""Of a request's path and host, the port of its server and the path there; None if there is no such server."""
+
+
+def by_path(find: Find) -> Route:
+    """Return the route of a lab. `find` returns the port of the server of this name; None if there is none."""
+
+    def route(path: str, _host: str) -> tuple[int, str] | None:
+        match = _PATH.fullmatch(path)
+        port = find(match[1]) if match else None
+        return (port, match[2]) if match and port is not None else None
+
+    return route
 
 
 class Relay(asyncio.Protocol):
-    """The browser's side of a connection. uvicorn makes one for each request for a WebSocket.
+    """The browser's side of a connection. uvicorn makes one for each request for a WebSocket."""
 
-    `find` returns the port of the game's server of this name; None if there is none.
-    """
-
-    def __init__(self, find: Find, *, config: Any, server_state: Any, app_state: Any) -> None:
-        self._find = find
+    def __init__(self, route: Route, *, config: Any, server_state: Any, app_state: Any) -> None:
+        self._route = route
         self._connections: set[Any] = server_state.connections
         self._waiting = bytearray()  # what the browser has sent before the server is connected
         self._connecting: asyncio.Task[None] | None = None
@@ -100,15 +113,16 @@ class Relay(asyncio.Protocol):
 
     def _begin(self) -> None:
         """Find the server that the request names, and connect to it."""
-        head, end, rest = bytes(self._waiting).partition(b"\r\n")
-        match = _REQUEST.fullmatch(head)
-        port = self._find(match[1].decode()) if match else None
-        if match is None or port is None:
+        request = _REQUEST.fullmatch(bytes(self._waiting))
+        host = _HOST.search(request[2]) if request else None
+        found = self._route(request[1].decode(), host[1].decode("latin-1").lower()) if request and host else None
+        if request is None or found is None:
             self._refuse("404 Not Found")
         elif _number(self._connections) > connections.most() // 2:  # the others are for pages
             self._refuse("503 Service Unavailable")
         else:
-            self._waiting = bytearray(b"GET %b %b%b%b" % (match[2], match[3], end, rest))
+            port, path = found
+            self._waiting = bytearray(b"GET %b HTTP/1.1\r\n%b" % (path.encode(), request[2]))
             self._browser.pause_reading()
             self._connecting = asyncio.get_running_loop().create_task(self._connect(port))
 

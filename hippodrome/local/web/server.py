@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import errno
 import socket
 import ssl
@@ -15,10 +14,9 @@ from typing import Any
 
 import uvicorn
 
-from hippodrome.local.web import connections
 from hippodrome.local.web.app import App
 from hippodrome.local.web.connections import HttpConnection
-from hippodrome.local.web.relay import Find, Relay
+from hippodrome.local.web.relay import Relay, Route
 
 HOST = "127.0.0.1"
 PORTS_TRIED = 20
@@ -26,7 +24,6 @@ _NO_ROOM = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)  # errors o
 
 Report = Callable[[BaseException], None]
 HIGHEST_PORT = 65535
-_PAUSE = 0.5  # seconds until the next try, after a connection could not be accepted
 
 
 class NoPort(Exception):
@@ -71,66 +68,15 @@ def _answers(port: int, host: str) -> bool:
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's server. `report` gets the error if this machine refuses a connection; it is accepted later.
+    """uvicorn's server. `report` gets the error if this machine refuses a connection; it is accepted later."""
 
-    With `tls` it accepts connections itself, since uvicorn limits neither the time nor the number of TLS handshakes.
-    """
-
-    def __init__(self, config: uvicorn.Config, report: Report | None, tls: ssl.SSLContext | None) -> None:
+    def __init__(self, config: uvicorn.Config, report: Report | None) -> None:
         super().__init__(config)
         self._report = report
-        self._tls = tls
-        self._accepting: asyncio.Task[None] | None = None
-        self._handshakes: dict[asyncio.Task[None], None] = {}  # the oldest first
 
     async def serve(self, sockets: list[socket.socket] | None = None) -> None:
         asyncio.get_running_loop().set_exception_handler(self._tell)
         await super().serve(sockets)
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        if self._tls is None or sockets is None:
-            await super().startup(sockets)
-            return
-        await super().startup([])
-        (listener,) = sockets
-        self._accepting = asyncio.get_running_loop().create_task(self._accept(listener, self._tls))
-
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        tasks = [*([self._accepting] if self._accepting else []), *self._handshakes]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        await super().shutdown(sockets)
-
-    async def _accept(self, listener: socket.socket, tls: ssl.SSLContext) -> None:
-        """Accept connections. If as many as `connections.most` are in their handshake, close the oldest of them."""
-        loop = asyncio.get_running_loop()
-        listener.setblocking(False)
-        while True:
-            try:
-                accepted, _ = await loop.sock_accept(listener)
-            except OSError as error:  # such as no more open files
-                if self._report is not None and error.errno in _NO_ROOM:
-                    self._report(error)
-                await asyncio.sleep(_PAUSE)
-                continue
-            if len(self._handshakes) >= connections.most():
-                oldest = next(iter(self._handshakes))
-                self._handshakes.pop(oldest)
-                oldest.cancel()
-            task = loop.create_task(self._shake_hands(accepted, tls))
-            self._handshakes[task] = None
-            task.add_done_callback(lambda done: self._handshakes.pop(done, None))
-            await asyncio.sleep(0)  # so the task begins, and owns the socket
-
-    async def _shake_hands(self, accepted: socket.socket, tls: ssl.SSLContext) -> None:
-        with contextlib.suppress(OSError):  # no TLS, or a handshake that took too long
-            await asyncio.get_running_loop().connect_accepted_socket(
-                self._protocol, accepted, ssl=tls, ssl_handshake_timeout=connections.HANDSHAKE_SECONDS
-            )
-
-    def _protocol(self) -> HttpConnection:
-        return HttpConnection(self.config, self.server_state, self.lifespan.state)
 
     def _tell(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
@@ -143,8 +89,8 @@ class _Server(uvicorn.Server):
 class WebServer:
     """uvicorn in a thread of its own, so that the main thread can wait for signals. `url` is its address.
 
-    It may be given, with another name than this machine's own. `find` returns the port of the game's server of a name:
-    then browsers reach the servers of games at this port, too.
+    It may be given, with another name than this machine's own. With `route`, browsers reach servers of games at this
+    port, too.
     """
 
     def __init__(
@@ -155,12 +101,12 @@ class WebServer:
         tls: ssl.SSLContext | None = None,
         *,
         url: str | None = None,
-        find: Find | None = None,
+        route: Route | None = None,
     ) -> None:
         self._app = app
         self._listener = listener
         self.url = url or address_of(listener, tls)
-        relay: Any = partial(Relay, find) if find is not None else "none"
+        relay: Any = partial(Relay, route) if route is not None else "none"
         config = uvicorn.Config(
             app,
             http=HttpConnection,
@@ -172,7 +118,9 @@ class WebServer:
             timeout_graceful_shutdown=2,
             timeout_keep_alive=5,
         )
-        self._server = _Server(config, report, tls)
+        config.load()
+        config.ssl = tls
+        self._server = _Server(config, report)
         self._thread = threading.Thread(target=self._server.run, args=[[listener]], name="web", daemon=True)
 
     @property

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from hippodrome.local.web import app as web_app
-from hippodrome.local.web import connections, server
+from hippodrome.local.web import connections, relay, server
 from testing.waiting import until
 
 HEAD = "GET /game/{name}/{rest} HTTP/1.1\r\nHost: lab.example:8000\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\r\n"
@@ -63,7 +63,7 @@ def site(game: Game) -> Iterator[server.WebServer]:
         nobody = free.getsockname()[1]
     app = web_app.App({}, lambda _: None, any_name=True)
     ports = {"s1": game.port, "gone": nobody}
-    made = server.WebServer(app, server.listen(0), find=ports.get)
+    made = server.WebServer(app, server.listen(0), route=relay.by_path(ports.get))
     made.start()
     yield made
     made.close()
