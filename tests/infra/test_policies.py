@@ -20,7 +20,6 @@ ON_EVERYTHING = {
     "ecs:DescribeTaskDefinition": "knows no resources",
     "ecs:ListClusters": "knows no resources",
     "ecs:ListTasks": "the tasks of a cluster are no resource; the condition names the cluster",
-    "pricing:GetProducts": "knows no resources",
     "scheduler:ListSchedules": "knows no resources",
     "ssm:DescribeParameters": "knows no resources",
 }

@@ -54,7 +54,6 @@ SHOWN = {  # every action of the policy: what it shows or does. Who adds one say
     "cloudwatch:DescribeAlarms": "alarms",
     "cloudwatch:GetMetricData": "counts",
     "ce:GetCostAndUsage": "money",
-    "pricing:GetProducts": "prices",
     "ssm:DescribeParameters": "names and dates of parameters, not what they hold",
     "ssm:PutParameter": "stores the key of a language model, and tells only its number of versions",
     "ssm:DeleteParameter": "removes that key",
