@@ -1,9 +1,12 @@
-"""Removes the data of one member from a session's recording, for the erasure of that participant.
+"""Removes the data of one member from a session's recordings and tapes, for the erasure of that participant.
 
-It removes the member's messages (with feedback and key presses), the times of key presses, the actions of their keys,
+From a recording it removes the member's messages (with feedback and key presses), the times of key presses, the actions of their keys,
 their round trips, the lines on their presence, the lines of callbacks on them, their outcome, and their id where it is
 a word of a text (`scrub.py`). The actions, rewards and scores of their player stay: without them the game of the others
 cannot be read or repeated. Lines without data of the member stay byte for byte.
+
+The member's lines of a tape stay, without text, so that the others' talk can be followed. A request to a language model
+holds the words of all: it goes, and its hash, its tokens and the model's name stay.
 """
 
 from __future__ import annotations
@@ -26,11 +29,15 @@ OF_KEYS = ("human", "pressedAt")
 
 
 def rewrite(source: Path, target: Path, seat: int, user: str) -> bool:
-    """Write the recording `source` into `target` without the data of the member at this seat, whose id is `user`.
+    """Write `source` into `target` without the data of the member at this seat, whose id is `user`.
 
-    Returns whether the two differ. A recording that was cut off stays cut off; lines that cannot be read are left out.
-    Raises OSError.
+    `source` is a recording, or if its name ends in `.json` a piece of a tape. Returns whether the two differ. A
+    recording that was cut off stays cut off; lines that cannot be read are left out. Raises OSError.
     """
+    if source.suffix == ".json":
+        piece = source.read_bytes()
+        target.write_bytes(_of_tape(piece, seat, user))
+        return target.read_bytes() != piece
     problems: list[str] = []
     pack = zlib.compressobj(6, zlib.DEFLATED, 31)
     erased: _Erased | None = None
@@ -104,3 +111,27 @@ class _Erased:
 
 def _without_keys(part: Any) -> Any:
     return {name: value for name, value in part.items() if name not in OF_KEYS} if isinstance(part, Mapping) else part
+
+
+def _of_tape(piece: bytes, seat: int, user: str) -> bytes:
+    """Return a piece of a tape without the member's words; without records, if it cannot be read."""
+    try:
+        tape = json.loads(piece)
+        records, seats = list(tape["records"]), [str(player) for player in tape["seats"]]
+        player = seats[seat]
+    except (ValueError, KeyError, TypeError, IndexError):
+        return b'{"schema":1,"records":[]}'
+    hide = Scrub({user: ""}).sparing(seats)
+    left = {**tape, "records": [hide.record(_unsaid(record, player)) for record in records]}
+    return piece if left == tape else json.dumps(left, separators=(",", ":")).encode()
+
+
+def _unsaid(record: Any, player: str) -> Mapping[str, Any]:
+    if not isinstance(record, Mapping):
+        return {}
+    if record.get("kind") == "line" and record.get("by") == player:
+        kept = {name: value for name, value in record.items() if name not in ("original", "typed")}
+        return {**kept, "text": "", "erased": True}
+    if record.get("kind") == "call" and "request" in record:
+        return {name: value for name, value in record.items() if name != "request"} | {"erased": True}
+    return record

@@ -1,16 +1,14 @@
-"""Gives a data folder of this machine the interface `Storage`: each file is a document with one version."""
+"""A data folder of this machine as a `Store`: each file is a document with one version."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from hippodrome.deployment.aws.object_version import Version
-from hippodrome.deployment.operate.storage import Note
-from hippodrome.export.fetch import remove_empty
 from hippodrome.protocol import disk
 
 SCRATCH = ".erase"
@@ -18,65 +16,53 @@ SCRATCH = ".erase"
 
 
 class DataFolder:
-    """The files of a data folder, which only one process may change."""
+    """The files of a data folder, which only one process may change. Implements `Store`."""
 
     def __init__(self, root: Path) -> None:
         self.root = root.resolve()
 
     def versions(self, prefix: str) -> Iterator[Version]:
-        """Yield every file whose key has this prefix."""
         for top, _, names in os.walk(self.root / prefix.rpartition("/")[0]):
             for name in sorted(names):
-                key = Path(top, name).relative_to(self.root).as_posix()
+                path = Path(top, name)
+                key = path.relative_to(self.root).as_posix()
                 if key.startswith(prefix):
-                    yield self._version(key)
-
-    def versions_of(self, key: str) -> Iterator[Version]:
-        """Yield the file with this key, if there is one."""
-        if (self.root / key).is_file():
-            yield self._version(key)
+                    yield Version(key, "", path.stat().st_size, latest=True)
 
     def uploads(self, prefix: str) -> Iterator[Version]:
-        """Yield nothing: on one machine a file appears whole, so there are no unfinished uploads."""
-        return iter(())
+        return iter(())  # a file appears whole
 
     def read(self, version: Version) -> bytes:
-        """Read the file's content; empty if the file is gone."""
-        with contextlib.suppress(FileNotFoundError):
-            return (self.root / version.key).read_bytes()
-        return b""
+        return (self.root / version.key).read_bytes()
 
     def fetch(self, version: Version, to: Path) -> None:
-        """Copy the file."""
         shutil.copyfile(self.root / version.key, to)
 
     def store(self, key: str, file: Path) -> None:
-        """Replace a file's content by that of `file`. The new content is on the disk before the name leads to it."""
         self._put(key, file)
 
     def replace(self, key: str, before: bytes, after: bytes) -> bool:
-        """Write a small document if it is still `before`. Return whether it was written."""
         if (self.root / key).read_bytes() != before:
             return False
         self._put(key, after)
         return True
 
-    def delete(self, versions: Iterable[Version], note: Note = lambda _: None) -> int:
+    def delete(self, versions: Iterable[Version], note: Callable[[Sequence[Version]], None]) -> None:
         """Delete these files, and folders that become empty."""
         deleted = list(versions)
         for file in deleted:
             path = self.root / file.key
             path.unlink(missing_ok=True)
-            remove_empty(path.parent, self.root)
+            with contextlib.suppress(OSError):  # the first folder that is not empty
+                for folder in path.parents:
+                    if folder == self.root:
+                        break
+                    folder.rmdir()
         note(deleted)
-        return len(deleted)
 
     def remove_unfinished(self) -> None:
         """Remove the files that a process was writing when it was killed."""
         shutil.rmtree(self.root / SCRATCH, ignore_errors=True)
-
-    def _version(self, key: str) -> Version:
-        return Version(key, "", (self.root / key).stat().st_size, latest=True)
 
     def _put(self, key: str, data: bytes | Path) -> None:
         scratch = self.root / SCRATCH

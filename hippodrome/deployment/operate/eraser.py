@@ -1,342 +1,283 @@
-"""Erases one participant from one project: first their server, then their documents; a last look proves it.
+"""Erases one participant's documents from one project: in a bucket, in all their versions, or in a data folder.
 
-Several participants play on their session's server. It is stopped like a server of the participant's own; the other
-members' data stay (`session_eraser.py`).
+First all documents that others share are written anew without the participant, and their earlier versions deleted.
+Then the participant's own documents are deleted; last the record of their server, which leads to others. So a run that
+is cut off anywhere is simply repeated: what is left leads to all the rest.
 
-If the participant played on a warm server, its handover document names them, and its record has their label. The
-participant's record leads to both, so it is deleted last.
-
-The documents (every version, delete marker and unfinished upload) are deleted only after the server's task has ended,
-since a trial that is told to stop still stores recordings. The server's presigned requests
-(`hippodrome/control/servers/signing.py`) stay valid for a short time after its end, and the eraser waits until then. If
-the participant or the server has stored something meanwhile, the next look finds it and the next round erases it.
+A session's documents belong to all its members. Each recording and tape is written anew without what this participant
+alone has sent (`hippodrome/export/without_member.py`), then the session's document without their id. When all members
+are erased, the session is deleted.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from datetime import timedelta
-from typing import TYPE_CHECKING
+import re
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
-from hippodrome.console import screen
-from hippodrome.console.problem import Problem
-from hippodrome.control.model import ids, server
-from hippodrome.control.model.messages import StopServer
-from hippodrome.control.model.records import from_json
-from hippodrome.control.model.server import Reason, Server
-from hippodrome.control.ports import DnsRecord, RunningTask
-from hippodrome.control.servers import resources
-from hippodrome.control.servers.leftovers import Scope, leftovers
-from hippodrome.control.servers.resources import Resources
-from hippodrome.deployment.aws.account import Account, Installation
+from hippodrome.control.limits.rules import ParticipantSlots, participant_slots_folder
+from hippodrome.control.lobby import decisions, entries, rules
+from hippodrome.control.lobby.decisions import Decisions
+from hippodrome.control.model import ids, memberships, server
+from hippodrome.control.model.balance import Cells, cells_key
+from hippodrome.control.model.records import from_json, to_json
+from hippodrome.control.model.server import Server
 from hippodrome.deployment.aws.object_version import Version
-from hippodrome.deployment.aws.versions import VersionedBucket
-from hippodrome.deployment.core.captured_log import functions_log
-from hippodrome.deployment.core.leftover_steps import cluster_steps, removal_steps
 from hippodrome.deployment.core.server_records import keys_of_warm_servers, warm_servers_of
-from hippodrome.deployment.core.stages import Executor, PlanStep, step
-from hippodrome.deployment.operate.cells_eraser import CellsEraser
-from hippodrome.deployment.operate.lobby_eraser import LobbyEraser
-from hippodrome.deployment.operate.receipt import ProjectReceipt
-from hippodrome.deployment.operate.session_eraser import FoundSession, SessionEraser
-from hippodrome.protocol.keys import participant_folder
+from hippodrome.export import without_member
+from hippodrome.protocol import session as sessions
+from hippodrome.protocol.keys import (
+    groups_folder,
+    membership_key,
+    participant_folder,
+    questions_folder,
+    session_folder,
+    session_key,
+    sessions_folder,
+)
 
-if TYPE_CHECKING:
-    from hippodrome.control.limits.slots import Slots
-
-ROUNDS = 6  # rounds of erasing and looking again, at most
-WAIT = 240  # seconds until a task must have ended: its stopTimeout is 120, and AWS needs some more
-SETTLED = timedelta(seconds=60)  # from this age of a server on, ECS lists its task if it has one
-SIGNING = 30  # seconds that `sign_requests` may take from reading a server's record to signing
+AT_ONCE = 10  # documents that are read at the same time
+_PLAYED = re.compile(r"\.jsonl\.gz$|/trials/[^/]+/[^/]+-talk-[0-9]+\.json$")  # a recording, or a piece of a tape
+_SERVER = re.compile(r"s[a-z2-7]{20}(?=[-.])")
 
 
-@dataclass
-class FoundOfParticipant:
-    """The results of one look for a participant in one project."""
+class Store(Protocol):
+    """Where documents lie: `VersionedBucket`, or `DataFolder`, in which each has one version. For several threads."""
 
-    documents: int = 0  # versions, delete markers and unfinished uploads
-    record: Server | None = None
-    resources: Resources = field(default_factory=Resources)
-    draining: list[RunningTask] = field(default_factory=list)  # tasks that are stopping
-    slots: int = 0  # documents of slots that name the participant (`maxParticipants`)
-    sessions: list[FoundSession] = field(default_factory=list)  # the participant's sessions
-    of_sessions: list[Server] = field(default_factory=list)  # the records of these sessions' servers
+    def versions(self, prefix: str) -> Iterator[Version]:
+        """Return every version and delete marker whose key has this prefix."""
 
-    def __bool__(self) -> bool:
-        return any(self.counts().values())
+    def uploads(self, prefix: str) -> Iterator[Version]:
+        """Return every unfinished upload whose key has this prefix."""
 
-    @property
-    def runs(self) -> bool:
-        """Whether a server runs, or resources of one are left."""
-        return bool(self.resources or self.draining or any(not record.is_closed for record in self.records))
+    def read(self, version: Version) -> bytes:
+        """Return the content of a version; empty if it is gone or is a delete marker."""
 
-    @property
-    def records(self) -> list[Server]:
-        """The record of the participant's own server, and the records of their sessions' servers."""
-        return [*([self.record] if self.record else []), *self.of_sessions]
+    def fetch(self, version: Version, to: Path) -> None:
+        """Write the content of a version into a file."""
+
+    def store(self, key: str, file: Path) -> None:
+        """Store a file's content as the newest version, whole or not at all."""
+
+    def replace(self, key: str, before: bytes, after: bytes) -> bool:
+        """Store a small document if its newest version is still `before`. Return whether it was stored."""
+
+    def delete(self, versions: Iterable[Version], note: Callable[[Sequence[Version]], None]) -> object:
+        """Delete these versions for good. `note` gets those that are deleted."""
+
+
+@dataclass(frozen=True)
+class FoundSession:
+    """A session of the participant. `others`: whether other members stay in it."""
+
+    id: str
+    seat: int
+    others: bool
+
+
+class Found(NamedTuple):
+    """What one look found: versions of own documents, keys of documents that others share, and sessions."""
+
+    own: list[Version]
+    shared: list[str]
+    sessions: list[FoundSession]
 
     def counts(self) -> dict[str, int]:
-        """Return how many documents and resources were found, by kind."""
-        counts = {"documents": self.documents, **self.resources.counts(), "slots": self.slots}
-        counts["tasks"] += len(self.draining)
-        if self.sessions:
-            counts["sessions"] = len(self.sessions)
-        return counts
+        """Return how much was found, by kind."""
+        return {"documents": len(self.own) + len(self.shared), "sessions": len(self.sessions)}
 
 
 class Eraser:
-    """Erases one participant from one project. May be interrupted anywhere and run again.
-
-    With `late=False` it does not wait until presigned requests are invalid; this is for bots, whose servers have ended.
-    """
+    """Erases one participant's documents from one project. None of their servers may run."""
 
     def __init__(
-        self,
-        account: Account,
-        installation: Installation,
-        project: str,
-        user: str,
-        *,
-        late: bool = True,
-        executor: Executor | None = None,
+        self, store: Store, project: str, user: str, *, plays: Callable[[str], bool] = lambda session: False
     ) -> None:
-        self.project = project
-        self.receipt = ProjectReceipt(project, user)
-        self._user = user
-        self._account = account
-        self._bucket = VersionedBucket(account, installation["Bucket"])
-        self._installation = installation
-        self._platform = account.platform(installation)
-        self._late = late
-        self._executor = executor or Executor()
+        """`plays` says whether a session plays again. Its document is then kept, and with it the way to its data."""
+        self.project, self.user = project, user
+        self.deleted = Counter[str]()  # deleted versions, by their keys without the participant's id
+        self.rewritten: dict[str, None] = {}  # the keys of documents that others share and that were written anew
+        self.unreadable: dict[str, None] = {}  # the keys of documents that name the participant and cannot be read
+        self._store, self._plays = store, plays
+        self._advance: Callable[[int], object] = lambda number: None
         self._label = ids.server_label(project, user)
         self._folder = participant_folder(project, user)
-        self._record_key = server.key(self._label)
-        self._scope = Scope(labels=frozenset({self._label}))
-        self._warm_servers = frozenset[str]()  # names of warm servers that were assigned to the participant
-        self._sessions = SessionEraser(self._bucket, project, user)
-        self._lobby = LobbyEraser(self._bucket, project, user)
-        self._cells = CellsEraser(self._bucket, project, user)
-
-    def run(self, advance: Callable[[int], None] = lambda _: None) -> FoundOfParticipant:
-        """Erase until a look finds nothing, in `ROUNDS` rounds at most. Return what the last look found.
-
-        Raises `Problem` if a server does not end.
-        """
-        return self._executor.converge(self.look, lambda state: self.plan(state, advance), rounds=ROUNDS, pause=0)
-
-    def look(self) -> FoundOfParticipant:
-        """Find everything about this participant. Changes nothing."""
-        record = self._record(self._record_key)
-        sessions = self._sessions.sessions()
-        labels = {session.id: ids.server_label(self.project, session.id) for session in sessions}
-        of_sessions = [of_session for label in labels.values() if (of_session := self._record(server.key(label)))]
-        self._warm_servers = self._warm_servers.union(warm_servers_of(record))
-        names = self._warm_servers.union(*map(warm_servers_of, of_sessions))
-        self._scope = Scope(labels=frozenset({self._label, *labels.values()}), names=names)
-        left = leftovers(resources.list_resources(self._platform), {}, self._scope)
-        own_name = record.dns_record if record else None
-        if own_name and own_name not in left.dns_records and self._is_in_zone(own_name):
-            left.dns_records.append(own_name)
-        participant_data = FoundOfParticipant(
-            documents=sum(1 for _ in itertools.chain(self._lobby.look(), self._cells.look(), *self._documents())),
-            record=record,
-            resources=left,
-            draining=self._draining(left.clusters),
-            slots=len(self._slots().documents_naming(self.project, self._user)),
-            sessions=sessions,
-            of_sessions=of_sessions,
-        )
-        self.receipt.remains, self.receipt.looked = participant_data.counts(), self._platform.now()
-        return participant_data
-
-    def plan(
-        self, participant_data: FoundOfParticipant, advance: Callable[[int], None] = lambda _: None
-    ) -> list[PlanStep]:
-        """Plan one round's steps: server, documents, and last the slot, so that no newcomer takes it too early."""
-        steps: list[PlanStep] = [step(self._begin_round)]
-        if participant_data.runs:
-            steps += [
-                step(self._stop, participant_data),
-                *removal_steps(self._platform, participant_data.resources),
-                step(self._wait),
-            ]
-            steps += cluster_steps(self._platform, participant_data.resources)
-        if not participant_data.resources.tasks and any(map(self._settling, participant_data.records)):
-            steps += [step(self._settle), step(self._wait)]
-        if self._late and participant_data.of_sessions:
-            steps.append(step(self._outlast_sessions, participant_data.sessions))
-        steps += [step(self._leave_session, session, advance) for session in participant_data.sessions]
-        steps += [step(self._leave_lobby, advance), step(self._delete, advance)]
-        if participant_data.slots:
-            steps.append(step(self._slots().release_participant, self.project, self._user))
-        if self._late and participant_data.record:
-            steps.append(step(self._outlast, participant_data.record))
-        return steps
-
-    def unreadable(self) -> list[str]:
-        """Return the keys of documents that may name this participant, but cannot be read."""
-        return [
-            *self._slots().unreadable(self.project),
-            *self._sessions.unreadable,
-            *self._lobby.unreadable,
-            *self._cells.unreadable,
-        ]
 
     # -- looking
 
-    def _slots(self) -> Slots:
-        from hippodrome.control.limits.slots import Slots  # noqa: PLC0415 - imports Powertools, which other commands do without
+    def look(self) -> Found:
+        """Find everything about this participant. Changes nothing."""
+        own = [*self._in_lobby(), *self._own()]
+        return Found(own, [key for key in self._shared() if self._names(self._body(key))], self.sessions())
 
-        return Slots(self._platform)
+    def sessions(self) -> list[FoundSession]:
+        """Find the sessions whose documents name the participant, in any version; and by their membership."""
+        found: dict[str, FoundSession] = {}
+        folder = sessions_folder(self.project)
+        versions = [version for version in self._store.versions(folder) if version.key.endswith("/session.json")]
+        for version, body in zip(versions, self._read(versions), strict=True):
+            try:
+                document = sessions.parse(body)
+            except sessions.BadSession:
+                if self._names(body):
+                    self.unreadable[version.key] = None
+                continue
+            if member := document.member(self.user):
+                others = any(user != self.user for user in document.user_ids)
+                before = found.get(document.id)
+                found[document.id] = FoundSession(document.id, member.seat, others and (not before or before.others))
+        theirs = self._membership()
+        if theirs and theirs.id not in found and any(self._store.versions(session_folder(self.project, theirs.id))):
+            found[theirs.id] = theirs  # the session's own document is lost, or was written anew before a run was cut off
+        return sorted(found.values(), key=lambda session: session.id)
 
-    def _tasks(self) -> tuple[list[RunningTask], list[RunningTask]]:
-        """Return two lists of tasks of the participant and their sessions: running tasks, and stopping tasks."""
-        tasks = [task for task in self._platform.tasks.list() if self._scope.erases(task.name)]
-        return tasks, self._draining([name for name in self._platform.tasks.clusters() if self._scope.erases(name)])
-
-    def _draining(self, clusters: Sequence[str]) -> list[RunningTask]:
-        tasks = self._platform.tasks.draining(self._installation["Cluster"], *clusters)
-        return [task for task in tasks if self._scope.erases(task.name)]
-
-    def _record(self, key: str) -> Server | None:
-        document = self._platform.documents.get(key)
+    def record(self, owner: str) -> Server | None:
+        """Read the record of the server of the participant, or of a session; None if none can be read."""
         try:
-            return from_json(document.body, Server) if document else None
-        except ValueError:  # no record; the document is deleted like any other
+            return from_json(self._body(server.key(ids.server_label(self.project, owner))), Server)
+        except ValueError:
             return None
 
-    def _is_in_zone(self, record: DnsRecord) -> bool:
-        """Whether the zone has this record. Listings of servers lack the names that `subdomain: userId` makes."""
-        answer = self._account.client("route53").list_resource_record_sets(
-            HostedZoneId=self._installation["HostedZoneId"],
-            StartRecordName=record.name,
-            StartRecordType="A",
-            MaxItems="1",
-        )
-        return any(
-            found["Type"] == "A"
-            and found["Name"].rstrip(".").lower() == record.name.lower()
-            and [value["Value"] for value in found.get("ResourceRecords", ())] == [record.host]
-            for found in answer["ResourceRecordSets"]
-        )
+    def _membership(self) -> FoundSession | None:
+        try:
+            membership = memberships.read(self._body(membership_key(self.project, self.user)))
+        except ValueError:
+            return None
+        return FoundSession(membership.session, membership.seat, others=True) if membership.session else None
 
-    def _documents(self) -> tuple[Iterator[Version], ...]:
-        """Return every version of the participant's own documents, in the order in which they must be deleted.
+    def _own(self) -> Iterator[Version]:
+        folder = self._folder
+        return chain(self._store.versions(folder), self._store.uploads(folder), self._of_server(self.user))
 
-        The record leads to the documents of warm servers, so it comes last.
+    def _of_server(self, owner: str) -> Iterator[Version]:
+        """Yield the documents of the warm servers that this owner was given, then the record, which leads to them."""
+        keys = keys_of_warm_servers(self.project, warm_servers_of(self.record(owner)))
+        for key in (*keys, server.key(ids.server_label(self.project, owner))):
+            yield from self._versions_of(key)
+
+    def _in_lobby(self) -> list[Version]:
+        """Return their entries, and the questions to the function `match`, and its answers, that name them."""
+        folders = (questions_folder(self.project), groups_folder(self.project))
+        asked = [version for folder in folders for version in self._store.versions(folder)]
+        naming = [version for version, body in zip(asked, self._read(asked), strict=True) if self._names(body)]
+        return [*self._store.versions(entries.prefix_of(self.project, self._label)), *naming]
+
+    def _shared(self) -> dict[str, Callable[[bytes], bytes]]:
+        """Return the keys of small documents that all participants share, each with the function that erases in it.
+
+        The functions raise ValueError for a document that they cannot read.
         """
-        of_warm_servers = itertools.chain.from_iterable(map(self._bucket.versions_of, self._warm_server_keys()))
-        return (
-            self._bucket.versions(self._folder),
-            self._bucket.uploads(self._folder),
-            of_warm_servers,
-            self._bucket.versions_of(self._record_key),
-        )
+        slots = {version.key for version in self._store.versions(participant_slots_folder(self.project))}
+        return {
+            decisions.key(self.project): self._out_of_decisions,
+            cells_key(self.project): lambda body: to_json(from_json(body, Cells).without(self.user)),
+            **dict.fromkeys(slots, lambda body: to_json(from_json(body, ParticipantSlots).without(self._label))),
+        }
 
-    def _warm_server_keys(self) -> list[str]:
-        """Return the keys of the handover documents and records of the participant's warm servers."""
-        return keys_of_warm_servers(self.project, self._warm_servers)
+    def _names(self, body: bytes) -> bool:
+        return self._label.encode() in body or f'"{self.user}"'.encode() in body
 
-    # -- steps
+    def _versions_of(self, key: str) -> list[Version]:
+        return [version for version in self._store.versions(key) if version.key == key]
 
-    def _begin_round(self) -> None:
-        self.receipt.rounds += 1
+    def _newest(self, key: str) -> Version | None:
+        return next((version for version in self._versions_of(key) if version.latest and not version.marker), None)
 
-    def _stop(self, participant_data: FoundOfParticipant) -> None:
-        """Count the resources for the receipt, and stop the servers as `stop_server` does."""
-        from hippodrome.control.servers.services import ServerServices  # noqa: PLC0415 - imports Powertools, which other commands do without
-        from hippodrome.control.servers.termination import Termination  # noqa: PLC0415 - the same
+    def _body(self, key: str) -> bytes:
+        newest = self._newest(key)
+        return self._store.read(newest) if newest else b""
 
-        for kind, number in participant_data.resources.counts().items():
-            self.receipt.removed[kind] += number
-        stops = [
-            StopServer(self.project, record.user_id, None, Reason.STOPPED)
-            for record in participant_data.records
-            if not record.is_closed
-        ]
-        if stops:
-            with functions_log():  # the following steps do again what fails here
-                Termination(ServerServices(self._platform)).stop(stops)
+    def _read(self, versions: Sequence[Version]) -> list[bytes]:
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            return list(pool.map(self._store.read, versions))
 
-    def _wait(self) -> None:
-        """Stop tasks that appear, and wait until none is left. Raises `Problem` if one runs after `WAIT` seconds."""
+    # -- erasing
 
-        def left() -> list[RunningTask]:
-            tasks, draining = self._tasks()
-            self._executor.execute(removal_steps(self._platform, Resources(tasks=tasks)))
-            return tasks + draining
+    def erase(self, advance: Callable[[int], object] = lambda number: None) -> None:
+        """Erase the participant. `advance` gets the numbers of versions that were deleted.
 
-        if self._executor.wait(left, WAIT):
-            raise Problem(
-                "Their server has been told to stop and still runs; their documents were not touched.",
-                "Wait a few minutes and run the same command again: it goes on from there.",
-            )
+        What somebody else has changed or stored meanwhile is left; a look finds it, and a second call erases it.
+        """
+        self._advance = advance
+        for session in self.sessions():
+            self._leave(session)
+        for key, without in self._shared().items():
+            self._rewrite(key, without)
+        self._delete(self._in_lobby())  # the lobby asks `match` again, without the participant
+        self._delete(self._own())
 
-    def _settling(self, record: Server) -> bool:
-        """Whether a task may have been started so recently that ECS does not list it yet."""
-        is_young = self._platform.now() - record.requested < SETTLED
-        return is_young and record.task is None and bool(record.cluster)
-
-    def _settle(self) -> None:
-        """Wait until ECS lists the task. If it has not after `SETTLED`, there is none."""
-        self._executor.wait(lambda: not self._tasks()[0], SETTLED.total_seconds())
-
-    def _leave_session(self, session: FoundSession, advance: Callable[[int], None]) -> None:
-        """Take the participant out of a session. If its server runs again, finish in the next round, which stops it."""
-        note = self._noting(advance)
-        key = server.key(ids.server_label(self.project, session.id))
-        if not session.others:
-            record = self._record(key)
-            if record is None or record.is_closed:
-                for keys_of_warm_server in (*keys_of_warm_servers(self.project, warm_servers_of(record)), key):
-                    self._bucket.delete(self._bucket.versions_of(keys_of_warm_server), note)
-                self._sessions.delete_session(session, note)
+    def _leave(self, session: FoundSession) -> None:
+        folder, document = session_folder(self.project, session.id), session_key(self.project, session.id)
+        keys = dict.fromkeys(version.key for version in self._store.versions(folder))
+        for key in filter(_PLAYED.search, keys):
+            self._rewrite_played(key, session.seat)
+        self._delete(self._store.uploads(folder))
+        if self._plays(session.id):
             return
-        self._sessions.take_out(session, note)
-        self.receipt.rewritten = self._sessions.rewritten
-        record = self._record(key)
-        if record is None or record.is_closed:
-            self._sessions.take_name(session, note)
+        if session.others:
+            self._rewrite(document, self._out_of_session)
+            return
+        self._delete((version for version in self._store.versions(folder) if version.key != document))
+        self._delete(self._of_server(session.id))
+        self._delete(self._versions_of(document))
 
-    def _leave_lobby(self, advance: Callable[[int], None]) -> None:
-        self._lobby.erase(self._noting(advance))
-        self._cells.erase(self._noting(advance))
+    def _rewrite(self, key: str, without: Callable[[bytes], bytes]) -> None:
+        """Write a document anew if it names the participant, unless somebody else writes it; delete its history."""
+        body = self._body(key)
+        if self._names(body):
+            try:
+                after = without(body)
+            except ValueError:
+                self.unreadable[key] = None
+                return
+            if not self._store.replace(key, body, after):
+                return
+            self.rewritten[self._nameless(key)] = None
+        self._delete_earlier(key)
 
-    def _noting(self, advance: Callable[[int], None]) -> Callable[[Sequence[Version]], None]:
-        def note(versions: Sequence[Version]) -> None:
-            self.receipt.note(versions)
-            advance(len(versions))
+    def _rewrite_played(self, key: str, seat: int) -> None:
+        newest = self._newest(key)
+        with tempfile.TemporaryDirectory(prefix="hippodrome-") as folder:
+            before, after = Path(folder, Path(key).name), Path(folder, "after")
+            if newest:
+                self._store.fetch(newest, before)
+                if without_member.rewrite(before, after, seat, self.user):
+                    self._store.store(key, after)
+                    self.rewritten[self._nameless(key)] = None
+        self._delete_earlier(key)
 
-        return note
+    def _delete_earlier(self, key: str) -> None:
+        """Delete all versions of a document but the newest; if that is a delete marker, all of them."""
+        versions = self._versions_of(key)
+        gone = any(version.latest and version.marker for version in versions)
+        self._delete((version for version in versions if gone or not version.latest))
 
-    def _delete(self, advance: Callable[[int], None]) -> None:
-        for versions in self._documents():
-            self._bucket.delete(versions, self._noting(advance))
+    def _delete(self, versions: Iterable[Version]) -> None:
+        self._store.delete(list(versions), self._note)
 
-    def _outlast(self, record: Server) -> None:
-        """Wait until all presigned requests of the server are invalid. It gets no new ones: its record is deleted."""
-        from hippodrome.control.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS  # noqa: PLC0415 - as above
+    def _note(self, deleted: Sequence[Version]) -> None:
+        self.deleted.update(self._nameless(version.key) for version in deleted)
+        self._advance(len(deleted))
 
-        # A server gets presigned requests until STORE_AFTER_CLOSE after its end. If that is over, the wait is shorter.
-        signed = STORE_AFTER_CLOSE.total_seconds()
-        if record.closed is not None:
-            signed -= (self._platform.now() - record.closed).total_seconds()
-        self._sleep(VALID_SECONDS + SIGNING + min(signed, 0))
+    def _nameless(self, key: str) -> str:
+        """Return the key without the participant's id, and without labels of servers, which are hashes of ids."""
+        rest = key.removeprefix(self._folder)
+        parts = ["{userId}" if self.user in part else _SERVER.sub("{server}", part) for part in rest.split("/")]
+        return "/".join(parts if rest == key else [self.project, "users", "{userId}", *parts])
 
-    def _outlast_sessions(self, sessions: Sequence[FoundSession]) -> None:
-        """Wait until the sessions' servers get no presigned requests any more, and all earlier ones are invalid."""
-        from hippodrome.control.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS  # noqa: PLC0415 - as above
+    def _out_of_decisions(self, body: bytes) -> bytes:
+        decided = from_json(body, Decisions)
+        return to_json(decisions.next_version(decided, rules.without(decided, self._label)))
 
-        records = (self._record(server.key(ids.server_label(self.project, session.id))) for session in sessions)
-        ends = [record.closed for record in records if record is not None and record.closed is not None]
-        if ends:
-            over = (self._platform.now() - max(ends)).total_seconds()
-            self._sleep(STORE_AFTER_CLOSE.total_seconds() + VALID_SECONDS + SIGNING - over)
-
-    def _sleep(self, seconds: float) -> None:
-        if seconds > 0:
-            screen.info(f"{seconds:.0f} seconds more: until then a presigned request of the server might be used.")
-            self._executor.sleep(seconds)
+    def _out_of_session(self, body: bytes) -> bytes:
+        document = sessions.parse(body)
+        members: tuple[Any, ...] = tuple(
+            replace(member, user_id="") if member.user_id == self.user else member for member in document.members
+        )
+        return replace(document, members=members).to_json()

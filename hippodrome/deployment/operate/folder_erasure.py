@@ -1,0 +1,178 @@
+"""Erases one participant on this machine, from a data folder that `hippodrome run` or `hippodrome try` has filled.
+
+`run` must not run meanwhile: its servers write recordings, and its functions read records. It keeps its own state
+beside the data folder, in `.hippodrome/`, and there too the data that `hippodrome run --fresh` has moved aside.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import getpass
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from hippodrome.console.problem import Problem
+from hippodrome.control.model import ids
+from hippodrome.control.model.project import MASTER_LIST, read_list
+from hippodrome.deployment.operate.data_folder import DataFolder
+from hippodrome.deployment.operate.eraser import Eraser
+from hippodrome.protocol.keys import participant_folder, session_folder, sessions_folder
+
+STATE = ".hippodrome"
+"""Where `hippodrome run` keeps tasks, messages and unfinished recordings, beside the data folder."""
+EARLIER = "earlier"
+"""The folder in `STATE` to which `hippodrome run --fresh` moves data and their state."""
+_UNMISTAKABLE = 6  # characters from which an id cannot well be a part of other values
+
+
+class FolderErasure:
+    """Erases one participant of one project from a data folder. May be interrupted anywhere and called again."""
+
+    def __init__(self, data: Path, project: str, user: str) -> None:
+        self.project, self.place = project, str(data)
+        self._folder, self._state = DataFolder(data), _state_of(data)
+        self.eraser = Eraser(self._folder, project, user)
+        self.ended: dict[str, int] = {}  # no server runs here
+
+    def look(self) -> dict[str, int]:
+        """Return how much there is of the participant, by kind. Changes nothing."""
+        return self.eraser.look().counts()
+
+    def run(self, advance: Callable[[int], object] = lambda number: None) -> dict[str, int]:
+        """Erase the participant, and return what is left. Raises `Problem` if `run` runs, or has left a server or an
+        unfinished recording."""
+        with self._locked():
+            self._must_be_over()
+            self._delete_state()
+            self.eraser.erase(advance)
+            self._folder.remove_unfinished()
+            return self.look()
+
+    def _delete_state(self) -> None:
+        """Delete what `run` keeps of the participant alone: unfinished recordings, tasks and logs."""
+        label = ids.server_label(self.project, self.eraser.user)
+        shutil.rmtree(self._state / "spool" / participant_folder(self.project, self.eraser.user), ignore_errors=True)
+        for folder in ("tasks", "logs"):
+            for file in (self._state / folder).glob(f"{label}*"):
+                file.unlink()
+
+    @contextlib.contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Hold the lock of `hippodrome run`, if that has ever run. Raises `Problem` if it runs now."""
+        lock = self._state.with_name(f"{self._state.name}.lock")
+        if not lock.exists():
+            yield
+            return
+        with lock.open("r+") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise Problem(
+                    f"The study runs now with the data in {self._folder.root}.",
+                    "End `hippodrome run` with Ctrl-C, then run the same command again.",
+                ) from None
+            yield
+
+    def _must_be_over(self) -> None:
+        """Raise `Problem` if a killed `run` has left a running server, or recordings that it has not moved."""
+        theirs = [session_folder(self.project, session.id) for session in self.eraser.sessions()]
+        folders = {participant_folder(self.project, self.eraser.user), *theirs}
+        runs = any(_runs(path, folders) for path in sorted((self._state / "tasks").glob("*")))
+        unfinished = any(path.is_file() for folder in theirs for path in (self._state / "spool" / folder).rglob("*"))
+        if runs or unfinished:
+            raise Problem(
+                "Their server still runs, or its recording is unfinished: `run` was killed. Nothing was touched.",
+                "Start `hippodrome run` once more and end it with Ctrl-C: it ends all servers and keeps what they "
+                "recorded.",
+            )
+
+
+def _runs(path: Path, folders: set[str]) -> bool:
+    """Whether this file describes a task for one of these folders whose process is alive."""
+    try:
+        task: dict[str, Any] = json.loads(path.read_bytes())
+        if f"{task.get('folder', '').rstrip('/')}/" not in folders or task.get("stopped"):
+            return False
+        os.kill(int(task["pid"]), 0)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return False
+    return True
+
+
+def erasures(data: Path, only: str | None, user: str) -> list[FolderErasure]:
+    """Return an erasure for each project, or for the project `only`: in the data folder, and in the data that
+    `hippodrome run --fresh` has moved aside. Raises `Problem` if there is no such folder or project."""
+    present = {project for folder in _folders(data) for project in _projects(folder)}
+    if not present:
+        raise Problem(
+            f"{data} is not a data folder: it holds no project.",
+            "Name the folder in which `hippodrome run` keeps data, such as --from ../my-study/data.",
+        )
+    if only not in (None, *present):
+        raise Problem(
+            f"{data} holds nothing of a project {only}.",
+            f"It holds: {', '.join(sorted(present))}. Without STUDY, the participant is erased in all of them.",
+        )
+    return [
+        FolderErasure(folder, project, user)
+        for folder in _folders(data)
+        for project in _projects(folder)
+        if only in (None, project)
+    ]
+
+
+def about(data: Path) -> dict[str, str]:
+    """Return the facts about this place for a receipt."""
+    return {"folder": str(data.resolve()), "by": getpass.getuser()}
+
+
+def _folders(data: Path) -> list[Path]:
+    if not data.is_dir():
+        raise Problem(f"There is no folder {data}.", "Name the data folder of `hippodrome run`.")
+    moved = data.resolve().parent / STATE / EARLIER
+    return [data, *sorted(moved.glob(f"{data.resolve().name}-*/data"))]
+
+
+def _projects(data: Path) -> list[str]:
+    """Return the ids of all projects in a data folder: those that are registered or have data of participants."""
+    present = {
+        path.name
+        for path in data.iterdir()
+        if (path / "users").is_dir() or (data / sessions_folder(path.name)).is_dir()
+    }
+    with contextlib.suppress(OSError, ValueError):
+        present.update(project.id for project in read_list((data / MASTER_LIST).read_bytes()).projects)
+    return sorted(filter(ids.is_project_id, present))
+
+
+def mentions(data: Path, user: str) -> list[Path]:
+    """Return the files in data folders and in their state whose path or content still names the participant.
+
+    What packed recordings hold is not looked at. A short id is only searched for where it must be an id.
+    """
+    bare = rf"(?<![\w-]){user}(?![\w-])"
+    names = [bare if len(user) >= _UNMISTAKABLE else rf'users/{user}/|Id": ?"{user}"']
+    found = []
+    for folder in _folders(data):
+        labels = [ids.server_label(project, user) for project in _projects(folder)]
+        pattern = re.compile("|".join([*names, *labels]).encode())
+        for root in (folder, _state_of(folder)):
+            for path in sorted(root.rglob("*")):
+                packed = path.suffix == ".gz"
+                where = os.fsencode(path.relative_to(root))
+                if path.is_file() and (pattern.search(where) or (not packed and pattern.search(path.read_bytes()))):
+                    found.append(path)
+    return found
+
+
+def _state_of(data: Path) -> Path:
+    """Return the folder where `run` keeps the state of this data folder. `--fresh` moves both side by side."""
+    root = data.resolve()
+    moved = root.parent.parent.name == EARLIER and root.parent.parent.parent.name == STATE
+    return root.parent / "state" if moved else root.parent / STATE / root.name
