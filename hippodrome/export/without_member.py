@@ -1,9 +1,9 @@
 """Removes the data of one member from a session's recordings and tapes, for the erasure of that participant.
 
-From a recording it removes the member's messages (with feedback and key presses), the times of key presses, the actions of their keys,
-their round trips, the lines on their presence, the lines of callbacks on them, their outcome, and their id where it is
-a word of a text (`scrub.py`). The actions, rewards and scores of their player stay: without them the game of the others
-cannot be read or repeated. Lines without data of the member stay byte for byte.
+From a recording it removes the member's messages (with feedback and key presses), the times of key presses, the
+actions of their keys, their round trips, the lines on their presence, the lines of callbacks on them, their outcome,
+and their id where it is a word of a text (`scrub.py`). The actions, rewards and scores of their player stay: without
+them the game of the others cannot be read or repeated. Lines without data of the member stay byte for byte.
 
 The member's lines of a tape stay, without text, so that the others' talk can be followed. A request to a language model
 holds the words of all: it goes, and its hash, its tokens and the model's name stay.

@@ -139,7 +139,7 @@ class Removal:
             return
         ecs, cluster = self.account.client("ecs"), installation["Cluster"]
         if inventory.bucket_exists(self.account, installation["Bucket"]):
-            stopper = Stopper(self.account.platform(installation), None, self.executor)
+            stopper = Stopper(self.account.platform(installation), executor=self.executor)
             with screen.ProgressBars() as bar:
                 task = bar.add_task("Stopping servers", total=None)
                 remaining = stopper.run(STOPPING, lambda stopped: bar.advance(task, stopped))

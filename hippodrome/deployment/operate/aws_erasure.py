@@ -1,82 +1,123 @@
-"""Erases a participant on AWS, and writes a receipt that does not name them."""
+"""Erases one participant on AWS: first their servers end, then their documents are erased; a last look proves it.
+
+Several participants play on their session's server. It is stopped like a server of the participant's own.
+
+A trial that is told to stop still stores recordings, and its presigned requests
+(`hippodrome/control/servers/signing.py`) stay valid for a while. So the documents are erased only when nothing that a
+server was allowed to store can arrive any more. If the participant comes back meanwhile, the next round erases that.
+"""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping
-from datetime import UTC, datetime
-from pathlib import Path
-
-from rich.progress import Progress, TaskID
+from collections.abc import Callable, Iterable, Sequence
 
 from hippodrome.console import screen
-from hippodrome.console.formatting import count
-from hippodrome.console.problem import Exit, Problem
+from hippodrome.console.problem import Problem
 from hippodrome.control.model import ids
-from hippodrome.deployment.aws.account import Account, Installation, find_installation
+from hippodrome.control.model.server import Server
+from hippodrome.control.servers.leftovers import Scope
+from hippodrome.deployment.aws.account import Account, Installation
 from hippodrome.deployment.aws.versions import VersionedBucket
 from hippodrome.deployment.core import participants
-from hippodrome.deployment.operate import receipt as receipts
-from hippodrome.deployment.operate.eraser import ROUNDS, Eraser, FoundOfParticipant
+from hippodrome.deployment.core.server_records import warm_servers_of
+from hippodrome.deployment.core.stages import Executor
+from hippodrome.deployment.operate.eraser import Eraser, FoundSession
+from hippodrome.deployment.operate.stop import Stopper
+
+ROUNDS = 6  # rounds of erasing and looking again, at most
+WAIT = 240  # seconds until a task must have ended: its stopTimeout is 120, and AWS needs some more
+SIGNING = 30  # seconds that `sign_requests` may take from reading a server's record to signing
 
 
-def erase(
-    account: Account,
-    stack: str,
-    only: str | None,
-    user: str,
-    *,
-    receipt: Path | None,
-    with_id: bool,
-    dry_run: bool,
-    yes: bool,
-    json: bool,
-) -> int:
-    """Erase the participant from the project `only`, or from all of the installation. Return the exit code.
+class AwsErasure:
+    """Erases one participant of one project from an installation. May be interrupted anywhere and run again."""
 
-    `receipt` is the file for the receipt; None: one in this folder.
+    def __init__(
+        self, account: Account, installation: Installation, project: str, user: str, executor: Executor | None = None
+    ) -> None:
+        self.project, self.place = project, installation.stack
+        self.eraser = Eraser(VersionedBucket(account, installation["Bucket"]), project, user, plays=self._plays)
+        self.ended: dict[str, int] = {}  # the servers that the first look found, and their resources, by kind
+        self.playing = 0  # sessions of theirs that play now, as the last look found
+        self._platform = account.platform(installation)
+        self._executor = executor or Executor()
+
+    def look(self) -> dict[str, int]:
+        """Return how much there is of the participant, by kind. Changes nothing."""
+        found = self.eraser.look()
+        self.playing = sum(self._plays(session.id) for session in found.sessions)
+        servers = self._stopper(found.sessions).look().counts()
+        self.ended = self.ended or servers
+        return {**found.counts(), **servers}
+
+    def run(self, advance: Callable[[int], object] = lambda number: None) -> dict[str, int]:
+        """Erase until a look finds nothing, in `ROUNDS` rounds at most. Return what the last look found.
+
+        Raises `Problem` if a server does not end.
+        """
+        for _ in range(ROUNDS):
+            self._end_servers(self.eraser.sessions())
+            self.eraser.erase(advance)
+            left = self.look()
+            if not any(left.values()):
+                break
+        return left
+
+    def _plays(self, session: str) -> bool:
+        record = self.eraser.record(session)
+        return record is not None and not record.is_closed
+
+    def _owners(self, sessions: Iterable[FoundSession]) -> dict[str, Server | None]:
+        """Return the records of the servers of the participant and of these sessions, by their labels."""
+        owners = [self.eraser.user, *(session.id for session in sessions)]
+        return {ids.server_label(self.project, owner): self.eraser.record(owner) for owner in owners}
+
+    def _stopper(self, sessions: Iterable[FoundSession]) -> Stopper:
+        owners = self._owners(sessions)
+        names = frozenset(name for record in owners.values() for name in warm_servers_of(record))
+        return Stopper(self._platform, Scope(labels=frozenset(owners), names=names), self._executor)
+
+    def _end_servers(self, sessions: Sequence[FoundSession]) -> None:
+        """End the servers and remove what belongs to them; wait until none of them can store anything any more."""
+        from hippodrome.control.servers.dns import delete_dns_records  # noqa: PLC0415 - imports Powertools, which other commands do without
+        from hippodrome.control.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS  # noqa: PLC0415 - as above
+
+        stopper = self._stopper(sessions)
+        if stopper.run(WAIT):
+            raise Problem(
+                "Their server has been told to stop and still runs; their documents were not touched.",
+                "Wait a few minutes and run the same command again: it goes on from there.",
+                list(stopper.errors),
+            )
+        records = [record for record in self._owners(sessions).values() if record is not None]
+        delete_dns_records(self._platform, [record.dns_record for record in records])  # no listing has all names
+        ends = [record.closed for record in records if record.closed is not None]
+        if ends:
+            over = (self._platform.now() - max(ends)).total_seconds()
+            seconds = STORE_AFTER_CLOSE.total_seconds() + VALID_SECONDS + SIGNING - over
+            if seconds > 0:
+                screen.info(f"{seconds:.0f} seconds more: until then a server of theirs might store something.")
+                self._executor.sleep(seconds)
+
+
+def erasures(account: Account, installation: Installation, only: str | None, user: str) -> list[AwsErasure]:
+    """Return an erasure for each project of the installation, or for the project `only`.
+
+    Raises `Problem` for an unknown project: a mistyped id must not look like an erasure.
     """
-    installation = find_installation(account, stack)
-    projects = _projects(account, installation) if only is None else [only]
-    erasers = [Eraser(account, installation, name, user) for name in projects]
-    by_project = {eraser.project: eraser.look() for eraser in erasers}
-    if only is not None and not any(by_project.values()):
-        _must_be_known(only, _projects(account, installation), stack)
-    if not json or dry_run:
-        _show(by_project, json, dry_run)
-    concerned = [name for name, data_found in by_project.items() if data_found]
-    if dry_run:
-        return Exit.CHANGES if concerned else Exit.DONE
-    if concerned:
-        screen.confirm(f"Erase this participant for good from {', '.join(concerned)}?", yes)
-    began, whole = datetime.now(UTC), False
-    target = receipt or _new_receipt(began)
-    if target.exists() or not target.parent.is_dir():
-        raise Problem(f"The receipt cannot be written to {target}.", "Name a new file in a folder that exists.")
-    try:
-        _erase(erasers, by_project)
-        whole = True
-    finally:
-        parts = [eraser.receipt for eraser in erasers]
-        written = receipts.receipt(parts, user, account, installation, began=began, whole=whole, with_id=with_id)
-        if whole or any(part.deleted for part in parts):
-            receipts.write(target, written)
-    if json:
-        screen.result_json(written)
-    _warn_of_unreadable(erasers)
-    if concerned:
-        screen.success(f"Everything is gone. The receipt: {target}")
-        screen.info("  Where this study was downloaded, run `hippodrome data` again: it removes them there.")
-    else:
-        screen.success(f"There is nothing of this participant. The receipt: {target}")
-    return Exit.DONE
+    known = _projects(account, installation)
+    if only not in (None, *known):
+        raise Problem(
+            f"The installation {installation.stack} holds nothing of a project {only}.",
+            f"Name another, or take --everywhere. It holds: {', '.join(known) or 'nothing yet'}.",
+        )
+    return [AwsErasure(account, installation, project, user) for project in known if only in (None, project)]
 
 
-def _new_receipt(began: datetime) -> Path:
-    """Choose a file name that is free in this folder, since a script may erase several participants in a second."""
-    name = f"erased-{began:%Y%m%dT%H%M%SZ}"
-    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
-    return next(path for path in map(Path, (f"{name}.json" for name in names)) if not path.exists())
+def about(account: Account, installation: Installation) -> dict[str, str]:
+    """Return the facts about this place for a receipt."""
+    place = {"stack": installation.stack, "region": installation.region, "bucket": installation["Bucket"]}
+    return {**place, "by": account.identity["Arn"]}
 
 
 def _projects(account: Account, installation: Installation) -> list[str]:
@@ -84,66 +125,3 @@ def _projects(account: Account, installation: Installation) -> list[str]:
     names = {project.id for project in participants.registered_projects(account.platform(installation).documents)}
     names.update(VersionedBucket(account, installation["Bucket"]).folders())
     return sorted(name for name in names if ids.is_project_id(name))
-
-
-def _must_be_known(project: str, project_ids: list[str], stack: str) -> None:
-    """Raise `Problem` for an unknown project: a mistyped id must not look like an erasure."""
-    if project not in project_ids:
-        raise Problem(
-            f"The installation {stack} holds nothing of a project {project}.",
-            f"Name another, or take --everywhere. It holds: {', '.join(project_ids) or 'nothing yet'}.",
-        )
-
-
-def _erase(erasers: list[Eraser], participants_data: Mapping[str, FoundOfParticipant]) -> None:
-    with screen.ProgressBars() as bars:
-        bar = bars.add_task("Erasing", total=sum(data_found.documents for data_found in participants_data.values()))
-        for eraser in erasers:
-            if participants_data[eraser.project] and (
-                remaining := eraser.run(lambda count: _advance(bars, bar, count))
-            ):
-                raise Problem(
-                    f"After {ROUNDS} rounds there is still something in {eraser.project}: {_words(remaining)}.",
-                    "The participant's link is in use. Close the study with `register --no-live`, and run this again.",
-                )
-
-
-def _warn_of_unreadable(erasers: list[Eraser]) -> None:
-    for key in itertools.chain.from_iterable(eraser.unreadable() for eraser in erasers):
-        screen.warning(
-            f"{key} cannot be read, and may hold a hash of the id: `hippodrome doctor --all` says what to do."
-        )
-
-
-def _advance(bars: Progress, bar: TaskID, count: int) -> None:
-    """Advance the bar. If more is deleted than was found, such as the server's last recording, the total grows."""
-    task = bars.tasks[0]
-    bars.update(bar, advance=count, total=max(task.total or 0, task.completed + count))
-
-
-def _show(participants_data: Mapping[str, FoundOfParticipant], json: bool, dry_run: bool) -> None:
-    if json:
-        screen.result_json({"found": {name: data_found.counts() for name, data_found in participants_data.items()}})
-        return
-    rows = [(name, *data_found.counts().values()) for name, data_found in participants_data.items() if data_found]
-    if rows:
-        heads = max((list(data_found.counts()) for data_found in participants_data.values()), key=len)
-        screen.table(["project", *heads], [(*row, *[0] * (len(heads) + 1 - len(row))) for row in rows], right=heads)
-        _warn_of_others(participants_data)
-    elif dry_run:
-        screen.result(f"There is nothing of this participant in {', '.join(participants_data) or 'any project'}.")
-
-
-def _warn_of_others(participants_data: Mapping[str, FoundOfParticipant]) -> None:
-    """Warn that the servers of sessions will be stopped on which other participants still play."""
-    playing = sum(
-        not session.is_closed for data_found in participants_data.values() for session in data_found.of_sessions
-    )
-    if playing:
-        screen.warning(
-            f"They play with others now: {count(playing, 'session')} will be stopped, for all who play there."
-        )
-
-
-def _words(participant_data: FoundOfParticipant) -> str:
-    return ", ".join(f"{count:,} {what}" for what, count in participant_data.counts().items() if count)

@@ -134,7 +134,7 @@ class Eraser:
                 found[document.id] = FoundSession(document.id, member.seat, others and (not before or before.others))
         theirs = self._membership()
         if theirs and theirs.id not in found and any(self._store.versions(session_folder(self.project, theirs.id))):
-            found[theirs.id] = theirs  # the session's own document is lost, or was written anew before a run was cut off
+            found[theirs.id] = theirs  # its own document is lost, or a run was cut off after that was written anew
         return sorted(found.values(), key=lambda session: session.id)
 
     def record(self, owner: str) -> Server | None:
@@ -223,7 +223,7 @@ class Eraser:
         if session.others:
             self._rewrite(document, self._out_of_session)
             return
-        self._delete((version for version in self._store.versions(folder) if version.key != document))
+        self._delete(version for version in self._store.versions(folder) if version.key != document)
         self._delete(self._of_server(session.id))
         self._delete(self._versions_of(document))
 
@@ -256,7 +256,7 @@ class Eraser:
         """Delete all versions of a document but the newest; if that is a delete marker, all of them."""
         versions = self._versions_of(key)
         gone = any(version.latest and version.marker for version in versions)
-        self._delete((version for version in versions if gone or not version.latest))
+        self._delete(version for version in versions if gone or not version.latest)
 
     def _delete(self, versions: Iterable[Version]) -> None:
         self._store.delete(list(versions), self._note)

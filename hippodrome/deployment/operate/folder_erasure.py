@@ -38,7 +38,8 @@ class FolderErasure:
         self.project, self.place = project, str(data)
         self._folder, self._state = DataFolder(data), _state_of(data)
         self.eraser = Eraser(self._folder, project, user)
-        self.ended: dict[str, int] = {}  # no server runs here
+        self.ended: dict[str, int] = {}  # no server runs
+        self.playing = 0
 
     def look(self) -> dict[str, int]:
         """Return how much there is of the participant, by kind. Changes nothing."""

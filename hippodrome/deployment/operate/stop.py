@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -32,6 +32,7 @@ from hippodrome.deployment.core.study_selection import one_or_all
 
 WAIT = 180  # seconds: a task may take its stopTimeout of 120 to store its recordings
 TOGETHER = 25  # servers stopped by one call: their DNS records go in one change of the zone
+EVERYTHING = Scope(without_record=True)
 AT_ONCE = 4  # such calls at the same time; Route 53 takes 10 requests a second
 
 
@@ -57,18 +58,18 @@ class FoundServers:
 
 
 class Stopper:
-    """Stops all servers, or the servers of one project, and looks until nothing of them is left.
+    """Stops all servers, or those in a scope: of a project, or of a participant; looks until nothing of them is left.
 
     It does the work of the function `stop_server` on this machine, so that it works even if queues or functions do not.
     Several commands may do this at the same time, and while the functions stop servers, too.
     """
 
-    def __init__(self, platform: AwsPlatform, project_id: str | None = None, executor: Executor | None = None) -> None:
+    def __init__(self, platform: AwsPlatform, scope: Scope = EVERYTHING, executor: Executor | None = None) -> None:
         from hippodrome.control.servers.services import ServerServices  # noqa: PLC0415 - imports Powertools, which other commands do without
         from hippodrome.control.servers.termination import Termination  # noqa: PLC0415 - the same
 
         self._platform = platform
-        self._scope = Scope(project_id=project_id, without_record=True)
+        self._scope = scope
         self._executor = executor or Executor()
         self._termination = Termination(ServerServices(platform))
         self._records = Records(platform.documents)
@@ -96,19 +97,28 @@ class Stopper:
         """
         platform = self._platform
         found = resources.list_resources(platform)
-        draining = list(platform.tasks.draining(found.cluster))
+        theirs = filter(self._scope.erases, found.clusters)
+        draining = list(platform.tasks.draining(found.cluster, *theirs))
         owners = self._records.owners([*found.names(), *(task.name for task in draining)])
         by_label = {record.label: record for record in owners.values()}
-        for record in self._records.open(platform.settings.max_runtime, platform.now()):
+        for record in self._open():
             by_label.setdefault(record.label, record)
         return FoundServers(
             sorted(
-                (record for record in by_label.values() if not record.is_closed and self._scope.covers(record)),
+                (record for record in by_label.values() if not record.is_closed and self._covers(record.name, record)),
                 key=lambda record: record.requested,
             ),
             leftovers(found, owners, self._scope),
-            [task for task in draining if self._scope.covers(owners.get(task.name))],
+            [task for task in draining if self._covers(task.name, owners.get(task.name))],
         )
+
+    def _open(self) -> Iterable[Server]:
+        if self._scope.labels:
+            return self._records.read(self._scope.labels).values()
+        return self._records.open(self._platform.settings.max_runtime, self._platform.now())
+
+    def _covers(self, name: str, owner: Server | None) -> bool:
+        return self._scope.erases(name) if self._scope.labels else self._scope.covers(owner)
 
     def plan(self, servers: FoundServers, advance: Callable[[int], None] = lambda _: None) -> list[PlanStep]:
         """Plan the steps that stop and remove what was found; empty if only tasks that are stopping are left."""
@@ -168,7 +178,7 @@ def command(
     installation = find_installation(account, stack)
     platform = account.platform(installation)
     live = [p for p in participants.choose(participants.registered_projects(platform.documents), project) if p.live]
-    stopper = Stopper(platform, project)
+    stopper = Stopper(platform, Scope(project_id=project, without_record=True))
     screen.info("Looking for servers …", "dim")
     state = stopper.look()
     if dry_run:

@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 from time import monotonic
@@ -14,6 +15,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from botocore.client import BaseClient
 
 from hippodrome.console.problem import Exit
 from hippodrome.control.aws.tasks import EcsTasks
@@ -21,7 +23,7 @@ from hippodrome.control.limits.slots import Slots
 from hippodrome.control.model import ids
 from hippodrome.control.model.messages import StartServer, parse_task_changed
 from hippodrome.control.model.server import ServerState
-from hippodrome.control.ports import RunningTask
+from hippodrome.control.ports import RunningTask, TaskRequest
 from hippodrome.control.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS
 from hippodrome.control.storage.repository import Repository
 from hippodrome.deployment.aws import versions as versioned
@@ -30,8 +32,10 @@ from hippodrome.deployment.aws.object_version import Version
 from hippodrome.deployment.aws.versions import VersionedBucket
 from hippodrome.deployment.core import stages
 from hippodrome.deployment.core.stages import Executor
-from hippodrome.deployment.operate.eraser import SIGNING, Eraser
+from hippodrome.deployment.operate.aws_erasure import SIGNING, AwsErasure
+from hippodrome.deployment.operate.eraser import Eraser
 from testing import template as cfn
+from testing.exploration import sample
 from testing.servers import Servers
 from testing.studies import study
 from tests.deployment.installation import CommandResult, Installed, account_here
@@ -47,7 +51,9 @@ def world(installed: Installed, tmp_path: Path, monkeypatch: Any, access_keys: N
     installed.register(STUDY, OTHER)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(stages, "PAUSE", 0)
-    monkeypatch.setattr("hippodrome.deployment.operate.eraser.SIGNING", -VALID_SECONDS)
+    monkeypatch.setattr(
+        "hippodrome.deployment.operate.aws_erasure.SIGNING", -VALID_SECONDS - STORE_AFTER_CLOSE.total_seconds()
+    )
     return installed
 
 
@@ -107,11 +113,11 @@ def test_a_participant_is_erased_from_a_kept_bucket_as_documented(
     before = versions(world, f"maze/users/{ANNA}/")
     names = re.compile(rb"%b\b|%b" % (ANN.encode(), ids.server_label("maze", ANN).encode()))
     assert any(map(names.search, bodies(world)))
-    (program,) = [block for block in code("docs/data.md", "python") if "sys.argv" in block and "SessionEraser" in block]
+    (program,) = [block for block in code("docs/data.md", "python") if "eraser.erase()" in block]
     monkeypatch.setattr(sys, "argv", ["forget.py", world.env["BUCKET"], "maze", ANN])
     capsys.readouterr()
     exec(program, {})
-    assert capsys.readouterr().out == "0 versions are left\n"
+    assert capsys.readouterr().out == "{'documents': 0, 'sessions': 0} left\n"
     assert not any(names.search(text) for text in [*bodies(world), *map(str.encode, versions(world))])
     assert versions(world, f"maze/users/{ANNA}/") == before
     assert versions(world, "project_master_list.json")
@@ -153,13 +159,13 @@ def test_the_receipt_says_what_was_erased_and_names_no_participant(world: Instal
     person = receipt["person"]
     assert person["sha256"] == hashlib.sha256(f"{person['salt']}{ANN}".encode()).hexdigest()
     (project,) = receipt["projects"]
-    assert set(project["remains"].values()) == {0}
-    assert project["deleted"]["answers"]["versions"] == 3
-    assert project["deleted"]["recordings"]["versions"] == 1
-    assert project["deleted"]["server record"]["versions"] >= 2
-    assert project["letGo"] == {"tasks": 1, "timers": 1, "names": 1, "clusters": 0}
-    assert project["keys"]["maze/users/{userId}/answers/1.json"] == 1
-    assert any("{server}-1/3-episode" in key for key in project["keys"])
+    assert set(project["left"].values()) == {0}
+    assert {key for key in project["deleted"] if "/answers/" in key} == {
+        f"maze/users/{{userId}}/answers/{step}.json" for step in (1, 2, 3)
+    }
+    assert any("{server}-1/3-episode" in key for key in project["deleted"])
+    assert project["deleted"]["_servers/{server}.json"] >= 2
+    assert project["ended"] == {"servers": 1, "tasks": 1, "timers": 1, "names": 1, "clusters": 0, "draining": 0}
     named = run(world, capsys, "--with-id", "--receipt", "named.json", "--json")
     assert named.json["person"]["userId"] == ANN
 
@@ -257,53 +263,37 @@ def test_documents_that_a_trial_saves_while_it_ends_are_erased_too(
     assert traces(world, ANN) == []
 
 
-class LateStore:
-    """Uses a presigned request, which the participant's server got at the last moment, just before it expires."""
-
-    def __init__(self, world: Installed) -> None:
-        self.world = world
-        self.seconds = 0.0
-        self.signed: float | None = None
-        self.used = False
-
-    def sleep(self, seconds: float) -> None:
-        for _ in range(round(seconds)):
-            self.seconds += 1
-            self._look()
-
-    def _look(self) -> None:
-        record = f"_servers/{ids.server_label('maze', ANN)}.json"
-        if self.signed is None and not versions(self.world, record):  # no more requests are signed for this server
-            self.signed = self.seconds - 1
-        if self.signed is not None and self.seconds == self.signed + VALID_SECONDS:
-            self.world.put(f"maze/users/{ANN}/answers/3.json", b"{}")
-            self.used = True
-
-
-@pytest.mark.parametrize("state", [ServerState.READY, ServerState.CLOSED])
+@pytest.mark.parametrize(
+    ("state", "seconds"),
+    [
+        (ServerState.READY, STORE_AFTER_CLOSE.total_seconds() + VALID_SECONDS + SIGNING),
+        (ServerState.CLOSED, VALID_SECONDS + SIGNING),
+    ],
+)
 def test_a_document_stored_late_by_an_earlier_presigned_request_is_erased(
-    world: Installed, capsys: Any, monkeypatch: Any, state: ServerState
+    world: Installed, monkeypatch: Any, state: ServerState, seconds: float
 ) -> None:
-    monkeypatch.setattr("hippodrome.deployment.operate.eraser.SIGNING", SIGNING)
+    monkeypatch.setattr("hippodrome.deployment.operate.aws_erasure.SIGNING", SIGNING)
     world.participant(ANN, answered=2)
-    closed = world.platform.now() - STORE_AFTER_CLOSE if state is ServerState.CLOSED else None
-    world.record(ANN, state, closed=closed)
-    thief = LateStore(world)
-    made = eraser(world, clock=lambda: thief.seconds, sleep=thief.sleep)
-    assert not made.run()
-    assert "seconds more" in capsys.readouterr().err
-    thief.sleep(VALID_SECONDS + SIGNING)
-    assert thief.used
+    world.record(ANN, state, closed=world.platform.now() - STORE_AFTER_CLOSE if state is ServerState.CLOSED else None)
+    slept: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        world.put(f"maze/users/{ANN}/answers/3.json", b"{}")
+
+    assert not erases(world, sleep=sleep)
+    assert max(slept) == pytest.approx(seconds, abs=20)
     assert traces(world, ANN) == []
 
 
 def test_a_participant_without_a_recent_server_is_erased_without_waiting(world: Installed, monkeypatch: Any) -> None:
-    monkeypatch.setattr("hippodrome.deployment.operate.eraser.SIGNING", SIGNING)
+    monkeypatch.setattr("hippodrome.deployment.operate.aws_erasure.SIGNING", SIGNING)
     world.participant(ANN, answered=2)
     over = timedelta(seconds=VALID_SECONDS + SIGNING)
     world.record(ANN, ServerState.CLOSED, closed=world.platform.now() - STORE_AFTER_CLOSE - over)
     slept: list[float] = []
-    assert not eraser(world, sleep=slept.append).run()
+    assert not erases(world, sleep=slept.append)
     assert slept == []
     assert traces(world, ANN) == []
 
@@ -318,7 +308,7 @@ def test_a_task_that_does_not_end_keeps_the_documents(world: Installed, capsys: 
     name = ids.server_name(ids.server_label("maze", ANN), 1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(EcsTasks, "draining", lambda self, *clusters: [RunningTask("arn", "hippodrome", name)])
-        patch.setattr("hippodrome.deployment.operate.eraser.WAIT", 0)
+        patch.setattr("hippodrome.deployment.operate.aws_erasure.WAIT", 0)
         ran = run(world, capsys)
     assert ran.code == Exit.FAILED
     assert "still runs" in ran.err
@@ -327,41 +317,43 @@ def test_a_task_that_does_not_end_keeps_the_documents(world: Installed, capsys: 
     assert traces(world, ANN) == []
 
 
-def eraser(
+def erases(
     world: Installed, clock: Callable[[], float] = monotonic, sleep: Callable[[float], None] | None = None
-) -> Eraser:
+) -> bool:
+    """Erase the participant. Returns whether anything is left."""
     account = account_here()
-    return Eraser(account, find_installation(account), "maze", ANN, executor=Executor(sleep, clock))
+    erasure = AwsErasure(account, find_installation(account), "maze", ANN, Executor(sleep, clock))
+    return any(erasure.run().values())
 
 
 def test_a_participant_who_returns_meanwhile_is_erased_again(world: Installed, monkeypatch: Any) -> None:
     world.participant(ANN, answered=2)
-    made, times = eraser(world), iter(range(2))
-    delete = made._delete
+    rounds, erase = [0], Eraser.erase
 
-    def delete_and_return(advance: Any) -> None:
-        delete(advance)
-        if next(times, None) is not None:
+    def erase_and_return(self: Eraser, advance: Any) -> None:
+        erase(self, advance)
+        rounds[0] += 1
+        if rounds[0] < 3:
             world.participant(ANN, answered=1)
             back = world.record(ANN, attempt=2)
             world.platform.timers.set(back.name, world.platform.now(), {})
             world.platform.dns.change(add=[back.dns_record] if back.dns_record else [])
 
-    monkeypatch.setattr(made, "_delete", delete_and_return)
-    assert not made.run()
-    assert made.receipt.rounds == 3
+    monkeypatch.setattr(Eraser, "erase", erase_and_return)
+    assert not erases(world)
+    assert rounds == [3]
     assert traces(world, ANN) == []
 
 
 def test_erase_reports_a_participant_who_keeps_returning(world: Installed, capsys: Any, monkeypatch: Any) -> None:
     world.participant(ANN, answered=2)
-    delete = Eraser._delete
+    erase = Eraser.erase
 
-    def delete_and_return(self: Eraser, advance: Any) -> None:
-        delete(self, advance)
+    def erase_and_return(self: Eraser, advance: Any) -> None:
+        erase(self, advance)
         world.participant(ANN, answered=1)
 
-    monkeypatch.setattr(Eraser, "_delete", delete_and_return)
+    monkeypatch.setattr(Eraser, "erase", erase_and_return)
     ran = run(world, capsys)
     assert ran.code == Exit.FAILED
     assert "--no-live" in ran.err
@@ -377,7 +369,7 @@ def test_each_of_several_erasures_in_one_second_has_its_own_receipt(
         def now(cls, tz: Any = None) -> datetime:
             return datetime(2026, 3, 4, 12, tzinfo=tz)
 
-    monkeypatch.setattr("hippodrome.deployment.operate.aws_erasure.datetime", Stopped)
+    monkeypatch.setattr("hippodrome.deployment.operate.erase.datetime", Stopped)
     names = ["erased-20260304T120000Z.json", "erased-20260304T120000Z-2.json", "erased-20260304T120000Z-3.json"]
     for number, name in enumerate(names, 1):
         ran = run(world, capsys)
@@ -385,34 +377,55 @@ def test_each_of_several_erasures_in_one_second_has_its_own_receipt(
         assert len(list(Path().glob("erased-*"))) == number
 
 
-@pytest.mark.parametrize("at", range(4))
-def test_a_run_after_an_interruption_finishes_the_erasure(
-    world: Installed, capsys: Any, monkeypatch: Any, at: int
+class Interruption(BaseException):
+    """The process ends here."""
+
+
+def interrupt_at(monkeypatch: Any, at: int) -> list[int]:
+    """End the process after the n-th call that changes something, which is before the next one; 0: count these calls."""
+    count = [0]
+    whole = BaseClient._make_api_call
+    changing = ("Put", "Delete", "Abort", "Upload", "Complete", "Create", "Stop", "Change")
+
+    def call(self: BaseClient, operation: str, params: Any) -> Any:
+        changes = operation.startswith(changing)
+        count[0] += changes
+        answer = whole(self, operation, params)
+        if changes and count[0] == at:
+            raise Interruption
+        return answer
+
+    monkeypatch.setattr(BaseClient, "_make_api_call", call)
+    return count
+
+
+@pytest.mark.explores
+def test_a_run_after_an_interruption_at_any_call_finishes_the_erasure(
+    world: Installed, capsys: Any, monkeypatch: Any
 ) -> None:
-    for number in range(3):
-        world.participant(ANN, answered=4, recordings=number)
-    start(world)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(versioned, "BATCH", 3)
-        calls = iter(range(100))
-        cut = ["_stop", "_wait", "_delete_batch", "_delete"][at]
-        owner = VersionedBucket if cut == "_delete_batch" else Eraser
-        whole = getattr(owner, cut)
+    """Each call that changes something is the last one of a run; the next run finishes the work (a sample of the calls)."""
+    monkeypatch.setattr(versioned, "BATCH", 3)
 
-        def cut_off(self: Any, *args: Any) -> None:
-            if next(calls) >= (1 if cut == "_delete_batch" else 0):
-                raise KeyboardInterrupt
-            whole(self, *args)
+    def check(at: int) -> int:
+        world.participant(ANN, answered=4, recordings=2)
+        start(world)
+        with pytest.MonkeyPatch.context() as patch:
+            count = interrupt_at(patch, at)
+            with suppress(Interruption):
+                run(world, capsys, "--receipt", f"cut-{at}.json")
+        partial = Path(f"cut-{at}.json")
+        cut = at > 0 and count[0] == at
+        assert not cut or not partial.exists() or json.loads(partial.read_text())["complete"] is False
+        if cut:
+            assert run(world, capsys, "--receipt", f"whole-{at}.json").code == Exit.DONE
+            assert json.loads(Path(f"whole-{at}.json").read_text())["complete"] is True
+        assert traces(world, ANN) == [], at
+        return count[0]
 
-        patch.setattr(owner, cut, cut_off)
-        assert run(world, capsys).code == Exit.INTERRUPTED
-    assert traces(world, ANN)
-    partial = [json.loads(path.read_text()) for path in Path().glob("erased-*.json")]
-    assert all(one["complete"] is False for one in partial)
-    assert bool(partial) == (cut == "_delete_batch")
-    assert run(world, capsys, "--receipt", "whole.json").code == Exit.DONE
-    assert traces(world, ANN) == []
-    assert json.loads(Path("whole.json").read_text())["complete"] is True
+    calls = check(0)
+    assert calls >= 7
+    for at in sample(range(1, calls + 1), 4):
+        check(at)
 
 
 def test_a_refused_deletion_fails_the_erasure(world: Installed, capsys: Any) -> None:
@@ -431,29 +444,25 @@ def test_a_refused_deletion_fails_the_erasure(world: Installed, capsys: Any) -> 
     assert "participant" not in deleted  # the receipt does not list refused deletions
 
 
-def test_erase_waits_for_a_new_task_that_ecs_does_not_list_yet(world: Installed, monkeypatch: Any) -> None:
+def test_a_new_task_that_ecs_lists_late_is_stopped(world: Installed, monkeypatch: Any) -> None:
+    monkeypatch.setattr("hippodrome.deployment.operate.aws_erasure.SIGNING", SIGNING)
     world.participant(ANN, answered=1)
     world.platform.timers.set(ids.server_name(ids.server_label("maze", ANN), 1), world.platform.now(), {})
     now = world.platform.now()
     world.record(ANN, ServerState.STARTING, requested=now)
     time = [0.0]
-    made = eraser(world, clock=lambda: time[0], sleep=lambda seconds: time.__setitem__(0, time[0] + 10))
-    tasks = made._tasks
-    looked = []
+    tasks = EcsTasks.list
 
-    def late() -> Any:
-        looked.append(time[0])
-        if time[0] >= 20 and len(world.task_arns()) == 0:
-            from hippodrome.control.ports import TaskRequest
-
+    def late(self: EcsTasks) -> Any:
+        if time[0] == 10 and not world.task_arns():
             name = ids.server_name(ids.server_label("maze", ANN), 1)
             world.platform.tasks.run(TaskRequest(name, "hippodrome", "hippodrome", 1, 2, {}))
-        return tasks()
+        return tasks(self)
 
-    monkeypatch.setattr(made, "_tasks", late)
-    assert not made.run()
+    monkeypatch.setattr(EcsTasks, "list", late)
+    assert not erases(world, clock=lambda: time[0], sleep=lambda seconds: time.__setitem__(0, time[0] + 10))
     assert world.task_arns()
-    assert [*world.platform.tasks.list()] == []
+    assert [*tasks(world.platform.tasks)] == []
     assert traces(world, ANN) == []
 
 
@@ -503,7 +512,7 @@ def test_the_warm_server_of_the_participant_is_erased_too(world: Installed, caps
     assert {task.name for task in world.platform.tasks.list()} == {others, waiting}
     receipt = Path("receipt.json").read_text()
     assert label not in receipt
-    assert json.loads(receipt)["projects"][0]["keys"]["maze/handovers/{server}.json"] == 2  # and a delete marker
+    assert json.loads(receipt)["projects"][0]["deleted"]["maze/handovers/{server}-1.json"] == 2  # and a delete marker
 
 
 def test_warm_servers_of_earlier_attempts_are_erased_too(world: Installed, capsys: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import gzip
+import itertools
 import json
 import os
 from collections.abc import Iterator
@@ -23,10 +24,10 @@ from hippodrome.control.lobby.decisions import Decisions, Unmatched
 from hippodrome.control.model import ids, server
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Server, ServerState
-from hippodrome.deployment.operate import folder_eraser
+from hippodrome.deployment.operate import folder_erasure
 from hippodrome.deployment.operate.data_folder import DataFolder
-from hippodrome.deployment.operate.folder_eraser import FolderEraser
-from hippodrome.deployment.operate.session_eraser import SessionEraser
+from hippodrome.deployment.operate.eraser import Eraser
+from hippodrome.deployment.operate.folder_erasure import FolderErasure
 from hippodrome.protocol.handover import Handover
 from hippodrome.protocol.keys import handover_key, session_key
 from hippodrome.protocol.session import parse
@@ -49,6 +50,7 @@ from tests.export.session_world import (
 )
 
 LABEL = ids.server_label("maze", ANN)
+_numbers = itertools.count()
 
 
 class Machine:
@@ -63,7 +65,10 @@ class Machine:
 
     def run(self, *more: str, user: str = ANN) -> CommandResult:
         self._capsys.readouterr()
-        code = main(["erase", user, *more])
+        receipt = (
+            [] if {"--receipt", "--dry-run"} & {*more} else ["--receipt", str(self.tmp / f"receipt-{next(_numbers)}")]
+        )
+        code = main(["erase", user, *more, *receipt])
         printed = self._capsys.readouterr()
         return CommandResult(code, printed.out, printed.err)
 
@@ -128,7 +133,7 @@ def test_an_id_that_is_a_word_of_the_format_destroys_no_data_of_the_others(tmp_p
     put(recording_key(), packed(tmp_path, made))
     put(tape_key(), tape((user, BOB)))
     before = recording.read((tmp_path / "data" / recording_key()).read_bytes())
-    SessionEraser(DataFolder(tmp_path / "data"), "maze", user).leave_sessions()
+    Eraser(DataFolder(tmp_path / "data"), "maze", user).erase()
     after = recording.read((tmp_path / "data" / recording_key()).read_bytes())
     assert after[0] == before[0]
     for wanted, found in zip(steps(before), steps(after), strict=True):
@@ -245,7 +250,7 @@ def test_an_erasure_in_one_project_says_where_else_the_participant_is(machine: M
     pair(machine.put, machine.tmp)
     machine.put(f"trust/users/{ANN}/participant.json", b"{}")
     ran = machine.erase("--yes")
-    assert (ran.code, "They are also in trust" in ran.err) == (Exit.DONE, True)
+    assert (ran.code, f"trust/users/{ANN}/participant.json still names them" in ran.err) == (Exit.DONE, True)
     assert machine.traces() == [f"trust/users/{ANN}/participant.json"]
 
 
@@ -284,7 +289,7 @@ def test_a_table_in_the_data_folder_that_names_the_participant_is_reported(machi
 @pytest.mark.parametrize(
     ("keys", "told"),
     [
-        ("", "1 file deleted"),
+        ("", "Everything is gone"),
         (", awsSetup: {cpu: 1, memory: 2}", "may be in two places: in data on this machine, and on AWS"),
     ],
     ids=["here", "here or on AWS"],
@@ -300,11 +305,19 @@ def test_without_from_the_data_are_those_of_this_machine_only_if_there_can_be_no
     assert (machine.traces() == [], ran.code == Exit.DONE) == (not keys, not keys)
 
 
-def test_a_receipt_is_not_promised_for_data_on_this_machine(machine: Machine) -> None:
-    pair(machine.put, machine.tmp)
-    before = machine.contents()
-    assert "On this machine there is no receipt" in machine.erase("--yes", "--receipt", "r.json").err
-    assert machine.contents() == before
+def test_the_receipt_says_what_was_erased_and_names_no_participant(machine: Machine) -> None:
+    study(machine.put, machine.tmp)
+    machine.put(f"_servers/{LABEL}.json", b"{}")
+    file = machine.tmp / "receipt.json"
+    assert machine.erase("--yes", "--receipt", str(file)).code == Exit.DONE
+    text = file.read_text()
+    assert ANN not in text
+    assert LABEL not in text
+    receipt = json.loads(text)
+    (project,) = receipt["projects"]
+    assert (receipt["complete"], receipt["folder"], set(project["left"].values())) == (True, str(machine.data), {0})
+    assert project["deleted"]["maze/users/{userId}/answers/1.json"] == project["deleted"]["_servers/{server}.json"] == 1
+    assert f"maze/sessions/{SID}/session.json" in project["rewritten"]
 
 
 class Interruption(BaseException):
@@ -341,10 +354,10 @@ def test_a_run_after_an_interruption_at_any_change_finishes(tmp_path: Path, caps
         machine.put(f"_lobby/maze/{LABEL}.way", b"{}")
         try:
             with interrupt_at(at, after):
-                FolderEraser(machine.data, "maze", ANN).run()
+                FolderErasure(machine.data, "maze", ANN).run()
             break
         except Interruption:
-            FolderEraser(machine.data, "maze", ANN).run()
+            FolderErasure(machine.data, "maze", ANN).run()
         assert machine.traces() == [], at
         assert said(BOB).encode() in machine.contents()[recording_key()]
         assert [path for path in machine.data.rglob("*") if ".erase" in path.name or path.suffix == ".new"] == []
@@ -362,7 +375,7 @@ def test_the_record_that_names_a_warm_server_is_erased_last(machine: Machine, ow
     machine.put(handover_key("maze", name), Handover(owner, None, name).to_json())
     for at in range(1, 8):
         with contextlib.suppress(Interruption), interrupt_at(at, after=True):
-            FolderEraser(machine.data, "maze", ANN).run()
+            FolderErasure(machine.data, "maze", ANN).run()
     assert machine.contents() == {}
 
 
@@ -370,7 +383,7 @@ def test_a_dry_run_and_a_missing_yes_change_nothing(machine: Machine) -> None:
     pair(machine.put, machine.tmp)
     before = machine.contents()
     dry = machine.erase("--dry-run", "--json")
-    assert (dry.code, dry.json["found"]) == (Exit.CHANGES, 7)
+    assert (dry.code, dry.json["found"]) == (Exit.CHANGES, {"maze": {"documents": 6, "sessions": 1}})
     assert machine.erase().code == Exit.DECLINED
     assert machine.erase("--everywhere").code == Exit.MISUSE
     assert machine.contents() == before
@@ -387,4 +400,4 @@ def test_a_document_that_has_changed_is_not_replaced(tmp_path: Path) -> None:
 def test_erase_and_make_run_agree_on_the_folder_of_the_lock() -> None:
     from hippodrome.local.run import ROOT
 
-    assert folder_eraser.STATE == ROOT
+    assert folder_erasure.STATE == ROOT

@@ -13,7 +13,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from botocore.client import BaseClient
 
 from hippodrome.console.problem import Exit
 from hippodrome.control.lobby import decisions, entries
@@ -26,9 +25,11 @@ from hippodrome.control.model.server import ServerState
 from hippodrome.control.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS
 from hippodrome.control.storage.repository import Repository
 from hippodrome.deployment.aws.account import find_installation
+from hippodrome.deployment.aws.versions import VersionedBucket
 from hippodrome.deployment.core import stages
 from hippodrome.deployment.core.stages import Executor
-from hippodrome.deployment.operate.eraser import SIGNING, Eraser
+from hippodrome.deployment.operate.aws_erasure import SIGNING, AwsErasure
+from hippodrome.deployment.operate.eraser import Eraser
 from hippodrome.protocol.keys import groups_key, session_key, sessions_folder, waiting_key
 from hippodrome.protocol.session import parse
 from hippodrome.trial.recordings import recording
@@ -36,6 +37,7 @@ from testing.exploration import sample
 from testing.servers import Servers
 from testing.studies import study
 from tests.deployment.installation import CommandResult, Installed, account_here
+from tests.deployment.operate.test_erase import Interruption, interrupt_at
 from tests.export.session_world import (
     ANN,
     BOB,
@@ -61,7 +63,7 @@ def world(installed: Installed, tmp_path: Path, monkeypatch: Any, access_keys: N
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(stages, "PAUSE", 0)
     monkeypatch.setattr(
-        "hippodrome.deployment.operate.eraser.SIGNING", -VALID_SECONDS - STORE_AFTER_CLOSE.total_seconds()
+        "hippodrome.deployment.operate.aws_erasure.SIGNING", -VALID_SECONDS - STORE_AFTER_CLOSE.total_seconds()
     )
     return installed
 
@@ -107,9 +109,14 @@ def start(world: Installed, session_id: str = SID) -> str:
     return task
 
 
-def eraser(world: Installed, user: str = ANN, **how: Any) -> Eraser:
+def erasure(world: Installed, user: str = ANN, **how: Any) -> AwsErasure:
     account = account_here()
-    return Eraser(account, find_installation(account), "maze", user, **how)
+    return AwsErasure(account, find_installation(account), "maze", user, **how)
+
+
+def run(world: Installed, user: str = ANN, **how: Any) -> bool:
+    """Erase the participant. Returns whether anything is left."""
+    return any(erasure(world, user, **how).run().values())
 
 
 def test_everything_of_one_member_is_erased_and_the_others_data_are_unchanged(
@@ -142,9 +149,11 @@ def test_everything_of_one_member_is_erased_and_the_others_data_are_unchanged(
     for hidden in (ANN, LABEL):
         assert hidden not in json.dumps(receipt) + ran.err
     (project,) = receipt["projects"]
-    assert (receipt["complete"], project["rewritten"], set(project["remains"].values())) == (True, 2, {0})
-    # Two versions of the recording, two of the session's document.
-    assert project["deleted"]["sessions"]["versions"] == 4
+    assert (receipt["complete"], set(project["left"].values())) == (True, {0})
+    assert len(project["rewritten"]) == 3  # two recordings, and the session's document
+    versions = {key: number for key, number in project["deleted"].items() if key.startswith("maze/sessions/")}
+    assert versions[session_key("maze", SID)] == 2
+    assert sum(versions.values()) == 5  # and a version of each recording, and an upload
 
 
 def test_data_can_be_exported_after_an_erasure(world: Installed, tmp_path: Path, capsys: Any) -> None:
@@ -179,27 +188,6 @@ def test_a_second_run_finds_nothing_and_changes_nothing(world: Installed, tmp_pa
     assert contents(world) == before
 
 
-class Interruption(BaseException):
-    """The process ends here."""
-
-
-def interrupt_at(monkeypatch: Any, at: int) -> list[int]:
-    """End the process after the n-th call that changes something, which is before the next one; 0: count these calls."""
-    count = [0]
-    whole = BaseClient._make_api_call
-
-    def call(self: BaseClient, operation: str, params: Any) -> Any:
-        changes = operation.startswith(("Put", "Delete", "Abort", "Upload", "Complete", "Create"))
-        count[0] += changes
-        answer = whole(self, operation, params)
-        if changes and count[0] == at:
-            raise Interruption
-        return answer
-
-    monkeypatch.setattr(BaseClient, "_make_api_call", call)
-    return count
-
-
 @pytest.mark.explores
 def test_a_run_after_an_interruption_at_any_call_finishes(world: Installed, tmp_path: Path) -> None:
     """Each call that changes something is the last one of a run; the next run finishes the work (a sample of the calls)."""
@@ -215,9 +203,9 @@ def test_a_run_after_an_interruption_at_any_call_finishes(world: Installed, tmp_
         with pytest.MonkeyPatch.context() as patch:
             count = interrupt_at(patch, at)
             with pytest.raises(Interruption) if at else nullcontext():
-                assert not eraser(world, user).run()
+                assert not run(world, user)
         if at:
-            assert not eraser(world, user).run()
+            assert not run(world, user)
         left = [
             key for (key, _), body in contents(world).items() if user in key or user.encode() in body or label in key
         ]
@@ -227,7 +215,7 @@ def test_a_run_after_an_interruption_at_any_call_finishes(world: Installed, tmp_
         words = gzip.decompress(body)
         assert (said(user).encode() in words, said(other).encode() in words) == (False, True)
         assert {m["player"] for line in recording.read(body) for m in line.get("messages", ())} == {"right"}
-        bucket = eraser(world)._bucket
+        bucket = VersionedBucket(account_here(), world.env["BUCKET"])
         bucket.delete(bucket.versions("maze/"))
         return count[0]
 
@@ -244,13 +232,13 @@ def test_erase_first_stops_a_session_that_plays(
     pair(world.put, tmp_path)
     start(world)
     order: list[str] = []
-    rewrite = Eraser._leave_session
+    rewrite = Eraser._leave
 
-    def leave(self: Eraser, found: Any, advance: Any) -> None:
+    def leave(self: Eraser, found: Any) -> None:
         order.append("while it ran" if list(world.platform.tasks.list()) else "rewritten")
-        rewrite(self, found, advance)
+        rewrite(self, found)
 
-    monkeypatch.setattr(Eraser, "_leave_session", leave)
+    monkeypatch.setattr(Eraser, "_leave", leave)
     ran = erase(world, capsys)
     assert ran.code == Exit.DONE, ran.err
     assert "1 session will be stopped, for all who play there" in ran.err
@@ -267,7 +255,7 @@ def test_erase_waits_until_the_sessions_server_can_store_nothing_more(
     world: Installed, tmp_path: Path, monkeypatch: Any
 ) -> None:
     """The server's record stays for the other members, so requests can be signed for it for a while after its end."""
-    monkeypatch.setattr("hippodrome.deployment.operate.eraser.SIGNING", SIGNING)
+    monkeypatch.setattr("hippodrome.deployment.operate.aws_erasure.SIGNING", SIGNING)
     pair(world.put, tmp_path)
     world.record(SID, ServerState.CLOSED, project=STUDY, closed=world.platform.now())
     slept: list[float] = []
@@ -276,7 +264,7 @@ def test_erase_waits_until_the_sessions_server_can_store_nothing_more(
         slept.append(seconds)
         world.put(recording_key(name="3-episode-0002"), packed(tmp_path, lines()))
 
-    assert not eraser(world, executor=Executor(sleep)).run()
+    assert not run(world, executor=Executor(sleep))
     (seconds,) = slept
     assert seconds == pytest.approx(STORE_AFTER_CLOSE.total_seconds() + VALID_SECONDS + SIGNING, abs=20)
     assert traces(world) == []
@@ -285,28 +273,26 @@ def test_erase_waits_until_the_sessions_server_can_store_nothing_more(
 def test_erase_does_not_wait_for_a_session_that_ended_long_ago(
     world: Installed, tmp_path: Path, monkeypatch: Any
 ) -> None:
-    monkeypatch.setattr("hippodrome.deployment.operate.eraser.SIGNING", SIGNING)
+    monkeypatch.setattr("hippodrome.deployment.operate.aws_erasure.SIGNING", SIGNING)
     pair(world.put, tmp_path)
     world.record(SID, ServerState.CLOSED, project=STUDY, closed=world.platform.now() - timedelta(minutes=10))
     slept: list[float] = []
-    assert not eraser(world, executor=Executor(slept.append)).run()
+    assert not run(world, executor=Executor(slept.append))
     assert slept == []
 
 
 def test_erase_stops_a_session_again_that_plays_again(world: Installed, tmp_path: Path, monkeypatch: Any) -> None:
     pair(world.put, tmp_path)
-    made, times = eraser(world), iter(range(1))
-    take_out = made._sessions.take_out
+    times, rewrite = iter(range(1)), Eraser._rewrite_played
 
-    def take_out_while_it_starts(found: Any, note: Any) -> None:
-        take_out(found, note)
+    def rewrite_while_it_starts(self: Eraser, key: str, seat: int) -> None:
+        rewrite(self, key, seat)
         if next(times, None) is not None:
             start(world)
             world.put(recording_key(attempt=1, name="3-episode-0002"), packed(tmp_path, lines()))
 
-    monkeypatch.setattr(made._sessions, "take_out", take_out_while_it_starts)
-    assert not made.run()
-    assert made.receipt.rounds == 2
+    monkeypatch.setattr(Eraser, "_rewrite_played", rewrite_while_it_starts)
+    assert not run(world)
     assert traces(world) == []
 
 
@@ -359,10 +345,11 @@ def test_questions_and_answers_of_match_are_erased(world: Installed, capsys: Any
     assert [key for key, _ in contents(world) if key == waiting_key("maze")] == [waiting_key("maze")] * 2
     assert world.keys("maze/lobby/groups/") == [groups_key("maze", "1" * 20)]
     (project,) = json.loads(Path("receipt.json").read_text())["projects"]
-    assert {kind for kind, counts in project["deleted"].items() if counts["versions"]} == {
-        "lobby",
-        "participant",
-        "answers",
+    assert set(project["deleted"]) == {
+        waiting_key("maze"),
+        groups_key("maze", "0" * 20),
+        "maze/users/{userId}/participant.json",
+        "maze/users/{userId}/answers/1.json",
     }
 
 
@@ -376,7 +363,7 @@ def test_the_lobby_does_not_write_an_erased_participant_again(world: Installed, 
     world.participant(ANN, answered=1)
     if written:
         pair(world.put, tmp_path)
-    assert not eraser(world).run()
+    assert not run(world)
     Lobby(world.platform, Repository(world.platform.documents)).repair(STUDY)
     assert traces(world) == []
     assert [each.user_id for each in parse(world.get(session_key("maze", SID))).members] == ["", BOB]
@@ -385,16 +372,15 @@ def test_the_lobby_does_not_write_an_erased_participant_again(world: Installed, 
 def test_a_lobby_that_changed_meanwhile_is_erased_from_in_the_next_round(world: Installed, monkeypatch: Any) -> None:
     world.participant(ANN, answered=1)
     world.put(decisions.key("maze"), to_json(Decisions(1, open=(OpenSession("s.1", datetime.now(UTC), LABEL),))))
-    made, times = eraser(world), iter(range(1))
-    replace = made._bucket.replace
+    times, replace = iter(range(1)), VersionedBucket.replace
 
-    def replace_too_late(key: str, before: bytes, after: bytes) -> bool:
+    def replace_too_late(self: VersionedBucket, key: str, before: bytes, after: bytes) -> bool:
         if next(times, None) is not None:
             world.put(key, to_json(msgspec.structs.replace(from_json(before, Decisions), version=2)))
-        return replace(key, before, after)
+        return replace(self, key, before, after)
 
-    monkeypatch.setattr(made._bucket, "replace", replace_too_late)
-    assert not made.run()
+    monkeypatch.setattr(VersionedBucket, "replace", replace_too_late)
+    assert not run(world)
     assert traces(world) == []
     assert from_json(world.get(decisions.key("maze")), Decisions).version == 3
 
@@ -417,7 +403,7 @@ def test_an_unreadable_document_that_names_the_participant_is_reported(
     pair(world.put, tmp_path)
     world.put(session_key("maze", OTHER), f'{{"members": "{ANN}"}}'.encode())
     ran = erase(world, capsys)
-    assert f"maze/sessions/{OTHER}/session.json cannot be read" in ran.err
+    assert f"maze/sessions/{OTHER}/session.json in hippodrome cannot be read" in ran.err
 
 
 def test_a_member_is_erased_from_a_kept_bucket_as_documented(
@@ -427,12 +413,12 @@ def test_a_member_is_erased_from_a_kept_bucket_as_documented(
     world.put(f"_lobby/maze/{LABEL}.way", b"{}")
     world.put(waiting_key("maze"), json.dumps({"waiting": [{"id": LABEL, "answers": {"age": 41}}]}).encode())
     theirs = of(world, BOB)
-    (program,) = [block for block in code("docs/data.md", "python") if "SessionEraser" in block]
+    (program,) = [block for block in code("docs/data.md", "python") if "eraser.erase()" in block]
     for user in (ANN, BOB):
         monkeypatch.setattr(sys, "argv", ["forget.py", world.env["BUCKET"], "maze", user])
         capsys.readouterr()
         exec(program, {})
-        assert capsys.readouterr().out == "0 versions are left\n"
+        assert capsys.readouterr().out == "{'documents': 0, 'sessions': 0} left\n"
         assert traces(world, user) == []
         assert of(world, BOB) == (theirs if user == ANN else {})
     assert not [key for key, _ in contents(world) if SID in key]

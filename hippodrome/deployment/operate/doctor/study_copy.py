@@ -22,6 +22,7 @@ from hippodrome.control.model.balance import cells_key
 from hippodrome.control.model.project import MASTER_LIST, STEPS_FOLDER, MasterList, Project, read_list, write_list
 from hippodrome.control.model.server import Server
 from hippodrome.control.ports import Conflict, Documents
+from hippodrome.control.servers.leftovers import Scope
 from hippodrome.control.storage.project_cache import FRESH
 from hippodrome.deployment.aws.versions import VersionedBucket
 from hippodrome.deployment.core import participants
@@ -90,7 +91,7 @@ class StudyCopy:
         unregister(self._documents, self.id)
         _until_functions_know()  # from now on, no function starts a server of the copy
         progress("stopping its servers")
-        stopper = Stopper(self._context.platform, self.id)
+        stopper = Stopper(self._context.platform, Scope(project_id=self.id, without_record=True))
         if stopper.run(GONE):
             raise Problem("A server of the copy still runs.", "Run `hippodrome stop --all`.", [*stopper.errors])
         progress("removing pages, answers and recordings")
