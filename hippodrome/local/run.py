@@ -6,8 +6,8 @@ import contextlib
 import errno
 import os
 import resource
-import select
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -31,7 +31,7 @@ from hippodrome.local.web import server
 from hippodrome.local.web.access import origin_of
 
 ROOT = ".hippodrome"
-STARTER_SECONDS = 1.0  # seconds between two looks whether the starter still runs
+LOOK = 0.5  # seconds between two looks: a signal that reaches another thread does not wake the main one
 
 
 def command(
@@ -184,13 +184,13 @@ def _run_study(
             study.close()
 
 
-def _wait(ended: int, starter: int | None) -> None:
-    """Return once a byte can be read from `ended`, or the process `starter` has ended (looked at once a second)."""
+def _wait(ended: threading.Event, starter: int | None) -> None:
+    """Return once `ended` is set, or the process `starter` has ended."""
     process = None
     with contextlib.suppress(psutil.NoSuchProcess):
         process = psutil.Process(starter) if starter is not None else None
-    while not select.select([ended], [], [], None if starter is None else STARTER_SECONDS)[0]:
-        if process is None or not process.is_running():
+    while not ended.wait(LOOK):
+        if starter is not None and (process is None or not process.is_running()):
             return
 
 
@@ -233,28 +233,19 @@ def _allow_more_files() -> None:
 
 
 @contextlib.contextmanager
-def _signals() -> Iterator[int]:
-    """A handle from which a byte can be read once a signal asks the process to end. The third signal ends it at once.
-
-    Python writes the byte as the signal arrives (`set_wakeup_fd`), in any thread. The handler runs later, in the main
-    thread: the signal does not wake that thread if another one got it, or if it was just about to read.
-    """
-    reader, writer = os.pipe()
-    os.set_blocking(writer, False)
-    signals = []
+def _signals() -> Iterator[threading.Event]:
+    """An event that is set when a signal asks the process to end. The third signal ends it at once."""
+    ended, signals = threading.Event(), list[int]()
 
     def count(number: int, _frame: object) -> None:
+        ended.set()
         signals.append(number)
-        if len(signals) > 2:  # the next start takes over the servers that still run
+        if len(signals) > 2:  # the next start ends the servers that still run
             os._exit(1)
 
-    woken = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     before = {number: signal.signal(number, count) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
-        yield reader
+        yield ended
     finally:
-        signal.set_wakeup_fd(woken)
         for number, handler in before.items():
             signal.signal(number, handler)
-        os.close(reader)
-        os.close(writer)

@@ -18,7 +18,6 @@ from hippodrome.functions import installed
 from hippodrome.local import publish
 from hippodrome.local.activity.log import ActivityLog
 from hippodrome.local.backend.platform import LocalPlatform
-from testing.waiting import until
 from tests.local.conftest import write_study
 
 
@@ -148,32 +147,6 @@ def test_the_terminal_shows_at_most_six_characters_of_an_id(user: str, shown: st
     activity_log, text = _activity_log()
     activity_log.participant(user, "arrived")
     assert text.getvalue().split()[1] == shown
-
-
-def test_the_lines_of_a_server_are_printed_in_order() -> None:
-    activity_log, text = _activity_log()
-    record = {"projectId": "p", "userId": "P1", "attempt": 1, "nonce": "n", "host": "127.0.0.1", "port": 5}
-
-    def server(state: str, reason: str = "") -> None:
-        activity_log.wrote("_servers/s.json", json.dumps({**record, "state": state, "reason": reason}).encode())
-
-    server("starting")
-    assert text.getvalue() == ""
-    activity_log.wrote("p/users/P1/answers/1.json", b'{"step": "1", "page": "a"}')
-    server("ready")
-    server("closed", "stopped")
-    activity_log.wrote("p/users/P1/answers/3.json", b'{"step": "3", "page": "b"}')
-    record = {**record, "userId": "P2"}
-    server("starting")  # nothing follows
-    until(lambda: "P2" in text.getvalue())
-    assert [line[10:].strip() for line in text.getvalue().splitlines()] == [
-        "P1       answered step 1 (a)",
-        "P1       server starting",
-        "P1       server ready at ws://127.0.0.1:5",
-        "P1       answered step 3 (b)",
-        "P1       server gone (stopped)",
-        "P2       server starting",
-    ]
 
 
 def test_the_terminal_shows_the_states_of_a_server() -> None:

@@ -27,7 +27,6 @@ from hippodrome.local.backend.task_process import folder_of
 from hippodrome.local.backend.tasks import ProcessTasks
 
 LOOK = 0.5  # seconds between looks for what servers have written
-HOLD_BACK = 0.8  # seconds for which a server's line waits for the participant's line that caused it
 ID_CHARACTERS = 6  # the characters of an id that are shown
 
 _SESSION = re.compile(r"[^/]+/sessions/([^/]+)/session\.json")
@@ -67,7 +66,6 @@ class ActivityLog:
         self._shown: set[str] = set()  # the keys of answers and the ids of sessions that were shown
         self._failing: set[str] = set()  # whose present server has written an error before it was ready
         self._last_steps: dict[str, str] = {}  # by project
-        self._held: dict[str, tuple[threading.Timer, str]] = {}  # lines that are held back, by participant
         self._looking = threading.RLock()
         self._watched: dict[str, WatchedServer] = {}
         self._closed = threading.Event()
@@ -92,29 +90,6 @@ class ActivityLog:
     def participant(self, user_id: str, text: str, style: str = "") -> None:
         """Show something that happens to a participant, in the Rich style `style`."""
         self._line(_short(user_id), text, style)
-
-    def _hold_back(self, user_id: str, text: str) -> None:
-        """Hold back a server's line, so that the participant's line which caused it comes first.
-
-        A message is sent before the document that causes it is written, so a server may be faster than the answer.
-        """
-        self._show_held(user_id)
-        timer = threading.Timer(HOLD_BACK, self._show_held, [user_id])
-        timer.daemon = True
-        with self._lock:
-            self._held[user_id] = (timer, text)
-        try:
-            timer.start()
-        except RuntimeError:  # the system gives no more threads
-            self._show_held(user_id)
-
-    def _show_held(self, user_id: str) -> None:
-        """Show the line that is held back, if there is one."""
-        with self._lock:
-            timer, text = self._held.pop(user_id, (None, ""))
-        if timer:
-            timer.cancel()
-            self.participant(user_id, text)
 
     def _line(self, who: str, text: str, style: str = "") -> None:
         line = Text.assemble((datetime.now().strftime("%H:%M:%S"), "dim"), "  ")
@@ -147,7 +122,6 @@ class ActivityLog:
             self._forget(key.removesuffix("participant.json"))
             group = record.get("group")
             self.participant(match[1], "arrived" if group is None else f"arrived, group {group}")
-            self._show_held(match[1])
         elif together:
             self._plays_together(together[1], record)
         elif match and match[2] == "session":
@@ -187,7 +161,6 @@ class ActivityLog:
         self.participant(user_id, f"{done} step {step}" + (f" ({page})" if kind.has_files else ""))
         if step == self._last_steps.get(key.partition("/")[0]):
             self.participant(user_id, "came to the end of the study", "green")
-        self._show_held(user_id)
 
     def _server(self, record: dict[str, Any]) -> None:
         try:
@@ -204,12 +177,8 @@ class ActivityLog:
             self._warm_server(record, state)
         elif state == "starting":
             self._failing.discard(user_id)
-            if attempt == 1:
-                self._hold_back(user_id, "server starting")
-            else:
-                self.participant(user_id, f"server starting, attempt {attempt}")
+            self.participant(user_id, "server starting" + (f", attempt {attempt}" if attempt > 1 else ""))
         elif state == "ready":
-            self._show_held(user_id)
             if user_id in self._failing:
                 return  # it listens, but no game will begin on it
             which = "has a warm server" if record.get("warmServerName") else "server ready"
@@ -219,10 +188,6 @@ class ActivityLog:
         elif state == "closed":
             reason = str(record.get("reason"))
             text = f"server gone ({_CAUSES.get(str(record.get('cause'))) or _REASONS.get(reason, reason)})"
-            if reason == "stopped" and not self._closed.is_set():
-                self._hold_back(user_id, text)
-                return
-            self._show_held(user_id)
             self.participant(user_id, text, "yellow" if reason in ("lost", "refused", "no capacity", "full") else "")
 
     def _warm_server(self, record: dict[str, Any], state: str) -> None:
@@ -248,8 +213,6 @@ class ActivityLog:
         self._closed.set()
         if self._thread:
             self._thread.join(2)
-        for user_id in [*self._held]:
-            self._show_held(user_id)
 
     def _look_on(self, tasks: ProcessTasks, data: Path) -> None:
         while not self._closed.wait(LOOK):

@@ -11,7 +11,6 @@ import os
 import re
 import secrets
 import shlex
-import shutil
 import signal
 import tempfile
 import time
@@ -140,12 +139,11 @@ def _running(
 ) -> Iterator[StudyProcess]:
     """Run the study, or a copy of it in which bots can end the game if `changed`. Nothing runs afterwards."""
     with tempfile.TemporaryDirectory(prefix="rehearsal-", ignore_cleanup_errors=True) as temporary:
-        place = Path(temporary)
-        project = place / "project" if changed else folder
+        project = Path(temporary) / "project" if changed else folder
         if changed and (changes := copy_of(folder, project)):
             words = " and ".join(changes)
             console.print(f"The bots walk through a copy of the project in which {words}.", soft_wrap=True)
-        study = StudyProcess(project, data, log=place / "local.log", real_llm=real_llm)
+        study = StudyProcess(project, data, log=logs_of(data) / "run.log", real_llm=real_llm)
         try:
             study.start()
             yield study
@@ -179,22 +177,6 @@ def _how_to_read(folder: Path, data: Path) -> str:
     study = "" if folder.resolve() == Path.cwd() else f" {shlex.quote(str(folder))}"
     command = f"hippodrome data{study} --from {shlex.quote(str(data))}"
     return f"The bots' data are in {data}. This makes tables of them: {command}"
-
-
-def _keep_logs(study: StudyProcess, project: Path) -> Path:
-    """Copy the logs to a folder that stays; there they name the project and the copied logs, not temporary folders."""
-    place = Path(tempfile.mkdtemp(prefix="rehearsal-log-"))
-    shutil.copy(study.log, place)
-    servers = logs_of(study.data)
-    if servers.is_dir():
-        shutil.copytree(servers, place / "logs")
-    names = {str(servers): str(place / "logs"), str(study.folder): str(project.resolve())}
-    for log in place.rglob("*.log"):
-        text = log.read_text(encoding="utf-8", errors="replace")
-        for before, after in names.items():
-            text = text.replace(before, after)
-        log.write_text(text, encoding="utf-8")
-    return place
 
 
 def _rehearse_and_report(
@@ -243,8 +225,7 @@ def _rehearse_and_report(
     )
     all_reached = reached.report(console, ends, read_source(folder)) if ends else True
     if not fine and study:
-        logs = _keep_logs(study, folder)
-        console.print(f"The logs of local mode and of the servers are in {logs}.", soft_wrap=True)
+        console.print(f"The logs of local mode and of the servers are in {logs_of(study.data)}.", soft_wrap=True)
     if study and data:
         console.print(as_typed(_how_to_read(folder, data)), markup=False, soft_wrap=True)
     return fine and all_reached
