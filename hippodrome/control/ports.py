@@ -24,6 +24,12 @@ class Conflict(Exception):
     """Another writer has created, changed or removed the document. The caller reads it again and decides anew."""
 
 
+class RetryLater(Exception):
+    """The message cannot be handled now. The queue should deliver it again."""
+
+    expected = True  # so that `log.failure` logs these errors as information
+
+
 class NoCapacity(Exception):
     """There is no capacity for this kind of task now: Spot has none left, or a quota is used up."""
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from hippodrome.control.log import failure, logger
 from hippodrome.control.model.messages import body_of
-from hippodrome.control.storage.errors import RetryLater
+from hippodrome.control.ports import RetryLater
 
 if TYPE_CHECKING:
     from hippodrome.control.servers.services import ServerServices

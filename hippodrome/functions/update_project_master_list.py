@@ -1,4 +1,4 @@
-"""Direct invocation: adds or replaces a project in `project_master_list.json`, signs links, or moves old secrets."""
+"""Direct invocation: adds or replaces a project in `project_master_list.json`, or signs links."""
 
 from typing import Any
 

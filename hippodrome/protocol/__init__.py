@@ -2,7 +2,7 @@
 
   section_keys.py        how the keys of config.yml are declared and checked
   trial.py, trial_sections.py    the keys of the section `trial` of config.yml
-  trial_check.py, trial_rules.py, values.py, players.py, key_maps.py    the checks of this section
+  trial_check.py, values.py, players.py    the checks of this section
   environment.py         the environment variables that a server is started with
   handover.py            the document that tells a warm server its participant
   session.py             the document that says who plays in a session, and the members' tokens
@@ -11,7 +11,7 @@
   times.py               how documents and recordings write a time
   disk.py                how both sides write files on one machine, so that a power cut leaves none half written
   exits.py               the exit codes of a server
-  keyboard.py            the names of keys
+  keyboard.py            the names of keys, and the maps of `trial` by key, action or player
   server_modules.py      the modules that every server imports, which no file of a researcher may hide
   similar.py             which known name was probably meant by an unknown one
 

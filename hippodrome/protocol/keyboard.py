@@ -1,17 +1,25 @@
 """Reads the names of keys in config.yml, as in `KeyboardEvent.key`, with `+` between keys that are held together.
 
+Checks also the maps of `trial` whose names the project chooses: `keys`, `labels` and `playerNames`. These checks get
+such a map and its path, and return the valid entries and the problems.
+
 Source of the names: https://www.w3.org/TR/uievents-key/. A letter is the same key with Shift and without.
 """
 
 from __future__ import annotations
 
 import re
+from typing import Any
 
+from hippodrome.protocol import values
+from hippodrome.protocol.section_keys import map_of, too_many
 from hippodrome.protocol.similar import nearest
-from hippodrome.protocol.values import printable, show
+from hippodrome.protocol.values import MAX_NAME, KeyPath, SectionProblem, checked, printable, show
 
 MAX_TOGETHER = 4
 """The largest number of keys that may be joined by `+`."""
+MAX_KEYS = 100
+"""The largest number of entries in one map: keys of one player, labels, or names."""
 
 _SPACE = " "
 _NAMED = frozenset(
@@ -100,3 +108,50 @@ def combination(text: str) -> str:
 def shown(combined: str) -> str:
     """Return the combination for a message, with `Space` for " "."""
     return printable("+".join("Space" if part == _SPACE else part for part in parts(combined)))
+
+
+# Maps of the section `trial`
+
+
+def _action(value: object) -> str:
+    """The name of an action in small letters, as the trial server has it."""
+    return values.action_name(value).lower()
+
+
+def actions_of_keys(value: dict[str, Any], path: KeyPath) -> tuple[dict[str, Any], list[SectionProblem]]:
+    """Check `keys`: a map `{key: action}`, or such a map for each player.
+
+    Returns the valid entries, and the problems.
+    """
+    if not value or not all(isinstance(key_map, dict) for key_map in value.values()):
+        return _one_players_keys(value, path)
+    by_player: dict[str, Any] = {}
+    problems: list[SectionProblem] = []
+    for player, keys in value.items():
+        by_player[str(player)], wrong = _one_players_keys(keys, (*path, player))
+        problems += wrong
+    return by_player, problems
+
+
+def _one_players_keys(value: dict[str, Any], path: KeyPath) -> tuple[dict[str, str], list[SectionProblem]]:
+    by_key: dict[str, str] = {}
+    problems: list[SectionProblem] = []
+    names: dict[frozenset[str], str] = {}  # by combination: the same one can be written in several ways
+    for name, action in value.items():
+        here = (*path, name)
+        key, wrong = checked(lambda text: combination(str(text)), name, here)
+        action_name, wrong_action = checked(_action, action, here)
+        problems += wrong + wrong_action
+        if wrong or wrong_action:
+            continue
+        first = names.setdefault(frozenset(parts(key)), name)
+        if first != name:
+            problems.append(SectionProblem(here, f"is the same as {shown(first)}; keep one of them"))
+        by_key[key] = action_name
+    return by_key, problems + too_many(value, path, MAX_KEYS)
+
+
+labels = map_of(_action, values.text("the text of a button", MAX_NAME), MAX_KEYS)
+"""Checks `labels`, the texts of buttons: `{action: text}`."""
+player_names = map_of(str, values.text("what participants read", MAX_NAME), MAX_KEYS)
+"""Checks `playerNames`, the players' names for participants: `{player: text}`."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from hippodrome.protocol import key_maps, values
+from hippodrome.protocol import keyboard, values
 from hippodrome.protocol import players as player_checks
 from hippodrome.protocol import section_keys as keyed
 from hippodrome.protocol.keys import NAME
@@ -155,7 +155,7 @@ class TrialSection(Section):
                 ]
             },
         },
-        entries=key_maps.actions_of_keys,
+        entries=keyboard.actions_of_keys,
         kind="section",
         otherwise="by the actions' names",
         example="{ArrowLeft: left, a: left}",
@@ -164,7 +164,7 @@ class TrialSection(Section):
         "left: Go left",
         "Texts of the buttons, by action. An arrow's text stands below the arrow; with `keys`, the "
         "list of keys shows it, too.",
-        key_maps.labels,
+        keyboard.labels,
         kind="section",
         otherwise="the actions' names",
         example="{left: Go left}",
@@ -364,7 +364,7 @@ class TrialSection(Section):
     player_names: dict[str, str] = keyed.texts(
         "red: The red one",
         "With `project.players`: what participants read instead of the names that the environment has for its players.",
-        key_maps.player_names,
+        keyboard.player_names,
         kind="a map: the player's name and a text of at most 64 letters",
         otherwise="the names, with a capital",
         example="{agent_left: Red, agent_right: Blue}",

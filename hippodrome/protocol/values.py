@@ -38,7 +38,7 @@ class Plain:
 class SectionProblem(NamedTuple):
     """A mistake in the section `trial`: the path of the key below `trial`, and a sentence that says what to write.
 
-    `compared` has the keys that a rule compares (`trial_rules.py`); it is empty if the value is wrong by itself.
+    `compared` has the keys that a rule compares (`trial_check.py`); it is empty if the value is wrong by itself.
     """
 
     path: KeyPath

@@ -7,8 +7,8 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta
 
-from hippodrome.control.model import memberships
 from hippodrome.control.model.project import Project
+from hippodrome.control.model.sessions import read_membership
 from hippodrome.protocol.keys import answer_key, membership_key
 from testing.simulation.lobby import StoredDocuments, formed
 from testing.simulation.members import SimulatedMember
@@ -33,7 +33,7 @@ def _split(documents: StoredDocuments, project: Project, people: Sequence[Simula
     memberships_found = set()
     for user in {person.visit.user for person in people}:
         if stored := documents.get(membership_key(project.id, user)):
-            membership = memberships.read(stored[0])
+            membership = read_membership(stored[0])
             if membership.session is not None:
                 memberships_found.add((user, membership.session))
     for user, session in sorted(members - memberships_found):

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from hippodrome.control.model import ids
-from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.records import to_json
+from hippodrome.control.model.sessions import Membership
 from hippodrome.protocol.keys import membership_key, session_key, session_recordings_folder
 from hippodrome.protocol.session import Member, SessionDocument
 from hippodrome.trial.recordings import recording

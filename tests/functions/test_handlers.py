@@ -19,9 +19,8 @@ from hypothesis import strategies as st
 from hippodrome.control.model import ids, messages, server
 from hippodrome.control.model.project import Events
 from hippodrome.control.model.server import Reason, Server, ServerState
-from hippodrome.control.ports import DnsRecord, Topic
+from hippodrome.control.ports import DnsRecord, RetryLater, Topic
 from hippodrome.control.servers.causes import Cause
-from hippodrome.control.storage.errors import RetryLater
 from hippodrome.control.storage.secret import KEY
 from hippodrome.functions import (
     installed,

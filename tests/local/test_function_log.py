@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from hippodrome.control.log import failure
-from hippodrome.control.storage.errors import RetryLater
+from hippodrome.control.ports import RetryLater
 from hippodrome.local.activity.function_log import function_log
 from hippodrome.local.activity.log import ActivityLog
 

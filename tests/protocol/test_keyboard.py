@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hippodrome.protocol import key_maps, keyboard, trial, trial_check
+from hippodrome.protocol import keyboard, trial, trial_check
 
 
 def accepted(**section: Any) -> trial.TrialSection:
@@ -157,9 +157,9 @@ def test_of_keys_and_labels_the_valid_ones_are_kept_and_the_others_reported() ->
         ("playerNames", "red"),
     ]
     assert (checked.keys, checked.labels, checked.player_names) == ({}, {}, {})
-    found = [key_maps.actions_of_keys({"Foo": "left", "a": [], "b": "left"}, ())[0]]
-    found += [key_maps.labels({"left": [], "": "Go", "right": "Go right"}, ())[0]]
-    found += [key_maps.player_names({"red": {}, "blue": "The blue one"}, ())[0]]
+    found = [keyboard.actions_of_keys({"Foo": "left", "a": [], "b": "left"}, ())[0]]
+    found += [keyboard.labels({"left": [], "": "Go", "right": "Go right"}, ())[0]]
+    found += [keyboard.player_names({"red": {}, "blue": "The blue one"}, ())[0]]
     assert found == [{"b": "left"}, {"right": "Go right"}, {"blue": "The blue one"}]
 
 

@@ -16,10 +16,10 @@ from typing import Any
 from hippodrome.control.lobby.decisions import Decisions
 from hippodrome.control.lobby.decisions import key as lobby_key
 from hippodrome.control.model import ids
-from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import from_json
 from hippodrome.control.model.server import MAX_ATTEMPTS, Server
+from hippodrome.control.model.sessions import Membership
 from hippodrome.protocol.keys import answer_key, membership_key, sessions_folder
 from hippodrome.protocol.session import SessionDocument, member_token, parse
 from testing.port_faults import FaultAt

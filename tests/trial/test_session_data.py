@@ -12,8 +12,8 @@ import pytest
 
 from hippodrome.cli import main
 from hippodrome.console.problem import Exit
-from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.records import to_json
+from hippodrome.control.model.sessions import Membership
 from hippodrome.protocol.keys import membership_key
 from hippodrome.trial.core.recorded import RecordedTrial
 from hippodrome.trial.recordings.resume import add_lines

@@ -11,11 +11,20 @@ import argparse
 import io
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hippodrome.control.config import ConfigErrors, config_schema, layout, read_project
-from hippodrome.control.config.texts_file import texts_file
+from hippodrome.control.model.texts import GROUPS, LANGUAGE
+
+HEAD = """\
+# What Hippodrome says to participants, in English. docs/texts.md says where these texts are seen.
+# For another language copy everything from "texts:" on into your config.yml, below "project:", give the language, and
+# write your own words into the quotes. A text that you remove stays English.
+# A study whose participants play alone needs neither "The lobby" nor "Playing with others".
+project:
+  texts:
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -49,6 +58,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     sys.stdout.write(f"{layout.find(chosen.folder).config.name} is fine: {config.summary()}\n")
     return 0
+
+
+def texts_file() -> str:
+    """Return the content of `docs/texts.en.yml`. Its `language` is empty, so that `hippodrome check` asks for it."""
+    groups = ("".join(_group(title, texts)) for title, texts in GROUPS.items())
+    return HEAD + "\n".join(groups)
+
+
+def _group(title: str, texts: Mapping[str, str]) -> list[str]:
+    return [f"    # {title}\n", *(f"    {name}:{_value(name, text)}\n" for name, text in texts.items())]
+
+
+def _value(name: str, text: str) -> str:
+    return "  # of your words, such as fr" if name == LANGUAGE else f" {json.dumps(text, ensure_ascii=False)}"
 
 
 if __name__ == "__main__":

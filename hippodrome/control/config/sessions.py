@@ -108,7 +108,7 @@ def _one_game_for_all(checked: Checked) -> Iterator[Mistake]:
 
 
 def _empty_places(checked: Checked) -> Iterator[Mistake]:
-    """`afterPatience: policies` needs `substitute`. (`protocol/trial_rules.py` checks `afterAbsent: policy`.)"""
+    """`afterPatience: policies` needs `substitute`. (`protocol/trial_check.py` checks `afterAbsent: policy`.)"""
     trial = checked.trial
     needs = checked.project.after_patience == "policies" and trial.after_absent != "policy"
     path: KeyPath = ("trial", "substitute")

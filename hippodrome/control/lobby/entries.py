@@ -47,7 +47,7 @@ class Waiting:
     """A participant who waits in the lobby.
 
     `joined`: when they came, in ms since 1970, as in the key. `seen`: the time of their last request. `trait`: see
-    `traits.py`.
+    `matchmaking.trait`.
     """
 
     label: str

@@ -3,8 +3,8 @@
 This module handles participants' requests and start messages. Each request of a participant at the game step makes a
 *run*:
 1. It reads the document of decisions (`decisions.py`), and lists the entries in the lobby's folder (`entries.py`).
-2. It looks up who can be a member, and which servers are ready (`lookups.py`).
-3. It decides (`run.py`, by `rules.py`), and writes the document if something has changed. If another run has written
+2. It looks up who can be a member, and which servers are ready (`run.py`).
+3. It decides (by `rules.py`), and writes the document if something has changed. If another run has written
    the document since step 1, it reads the document and decides again; mostly nothing is left to do.
 4. It carries out the decisions that are made for good (`store.py`): it writes the session's document, sends its
    server's start message, and writes each member's membership; then it deletes the entries, and marks the decision as
@@ -30,22 +30,20 @@ from functools import partial
 from typing import Any
 
 from hippodrome.control.lobby import entries as lobby_entries
-from hippodrome.control.lobby import matchmaking, questions, rules, servers_ahead, traits
+from hippodrome.control.lobby import matchmaking, questions, rules, servers_ahead
 from hippodrome.control.lobby.decisions import Decisions, Formed, Proposal, Unmatched
 from hippodrome.control.lobby.entries import Entries, Waiting, WaitingDocument
-from hippodrome.control.lobby.lookups import Lookups
 from hippodrome.control.lobby.matcher import Matcher
 from hippodrome.control.lobby.repair import Repair
-from hippodrome.control.lobby.run import StartedAhead
+from hippodrome.control.lobby.run import Lookups, StartedAhead
 from hippodrome.control.lobby.store import LobbyStore
 from hippodrome.control.log import logger
 from hippodrome.control.model import ids, sessions
 from hippodrome.control.model.matching import field_of
-from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Server
-from hippodrome.control.ports import Platform
-from hippodrome.control.storage.errors import RetryLater
+from hippodrome.control.model.sessions import Membership
+from hippodrome.control.ports import Platform, RetryLater
 from hippodrome.control.storage.repository import Repository
 from hippodrome.protocol.answer import UNMATCHED
 
@@ -301,7 +299,7 @@ class Lobby:
             is_back = departure is not None and now - departure.at < lobby_entries.PRESENT
             joined = departure.joined if departure is not None and is_back else lobby_entries.milliseconds(now)
             answers = me.answers() if field_of(project.matching) is not None else {}
-            waiting = Waiting(me.label, joined, traits.trait(project, me.group, answers), now)
+            waiting = Waiting(me.label, joined, matchmaking.trait(project, me.group, answers), now)
         refreshed = Waiting(waiting.label, waiting.joined, waiting.trait, now)
         own_key = lobby_entries.waiting_key(project.id, refreshed)
         self._documents.put(own_key, lobby_entries.body(WaitingDocument(me.user_id, me.group)))

@@ -15,9 +15,8 @@ from hippodrome.control.lobby.entries import Entries
 from hippodrome.control.lobby.questions import Candidate, MatchAnswer, Question
 from hippodrome.control.log import failure, logger
 from hippodrome.control.model.project import Project
-from hippodrome.control.ports import Platform
+from hippodrome.control.ports import Platform, RetryLater
 from hippodrome.control.storage.compare_and_swap import SharedDocuments
-from hippodrome.control.storage.errors import RetryLater
 from hippodrome.protocol.keys import groups_folder, groups_key, questions_folder, waiting_key
 
 FORGOTTEN = timedelta(minutes=5)

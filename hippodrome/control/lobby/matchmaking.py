@@ -1,21 +1,28 @@
 """Chooses which of the participants who wait play together: by arrival, by traits, or as `match` has chosen. Pure.
 
-Here a session is a sequence of its members, in the order of their arrival.
+Here a session is a sequence of its members, in the order of their arrival. A participant's trait decides who may play
+with whom (`matching` in config.yml).
 """
 
 from __future__ import annotations
 
+import hashlib
 import heapq
+import hmac
+import json
+import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
+from typing import Any
 
-from hippodrome.control.lobby import traits
-from hippodrome.control.lobby.entries import Waiting, milliseconds
+from hippodrome.control.lobby.entries import NO_TRAIT, Waiting, milliseconds
+from hippodrome.control.model.matching import field_of
 from hippodrome.control.model.project import Project
 
 PROPOSED_AT_ONCE = 50
 """The most sessions that one run proposes, so that a crowd makes no function slow. The next run proposes more."""
+TRAIT_LENGTH = 10  # hex digits
 
 
 def patience_is_over(joined: int, project: Project, now: datetime) -> bool:
@@ -38,7 +45,7 @@ def choose(
     )
     if project.asks_match:
         sessions = _of_match(candidates, project, chosen)
-    elif traits.together(project):
+    elif _together(project):
         sessions = _of_one_trait(candidates, project.players)
     else:
         sessions = list(_of_different_traits(candidates, project))
@@ -74,7 +81,7 @@ def _of_one_trait(free: Sequence[Waiting], players: int) -> list[Sequence[Waitin
 
 def _of_different_traits(free: Sequence[Waiting], project: Project) -> Iterator[Sequence[Waiting]]:
     """Full sessions, in the order of arrival. In none of them is a trait more often than it may be."""
-    most = traits.most_of_one(project)
+    most = _most_of_one(project)
     by_trait: dict[str, deque[Waiting]] = {}
     for person in free:
         by_trait.setdefault(person.trait, deque()).append(person)
@@ -119,7 +126,7 @@ def around(waiting: Waiting, free: Iterable[Waiting], project: Project) -> list[
 
     There are at most `players`, and fewer if not enough fit.
     """
-    members, most = [waiting], None if traits.together(project) else traits.most_of_one(project)
+    members, most = [waiting], None if _together(project) else _most_of_one(project)
     for other in free:
         if len(members) == project.players:
             break
@@ -128,3 +135,40 @@ def around(waiting: Waiting, free: Iterable[Waiting], project: Project) -> list[
         if other.label != waiting.label and fits:
             members.append(other)
     return sorted(members, key=lambda member: member.order)
+
+
+# Traits
+
+
+def trait(project: Project, group: int | None, answers: Mapping[str, Any]) -> str:
+    """Return the participant's trait: a hash of the answer or of the group by which `matching` matches.
+
+    Participants without an answer have the same trait as each other.
+    """
+    if (field := field_of(project.matching)) is not None:
+        return _hash(project, answers.get(field))
+    return _hash(project, group) if project.matching in ("group", "mixed") else NO_TRAIT
+
+
+def _together(project: Project) -> bool:
+    """Whether the members of a session must have the same trait; if not, they must have different ones."""
+    if isinstance(project.matching, dict):
+        return "same" in project.matching
+    return project.matching != "mixed"
+
+
+def _most_of_one(project: Project) -> int:
+    """How many members of a session may have the same trait if members must have different ones.
+
+    This is one. But with `matching: mixed` and fewer groups than players, several members must share a group: then it
+    is the number of players divided by the number of groups, rounded up.
+    """
+    mixed = project.matching == "mixed" and project.groups
+    return math.ceil(project.players / project.groups) if mixed else 1
+
+
+def _hash(project: Project, value: Any) -> str:
+    """The keyed hash of a value. A listing shows it, and only with the project's secret the value can be guessed."""
+    normalised = value.strip().casefold() if isinstance(value, str) else value
+    text = json.dumps(normalised, sort_keys=True, default=str)
+    return hmac.new(project.secret.encode(), f"trait\0{text}".encode(), hashlib.sha256).hexdigest()[:TRAIT_LENGTH]

@@ -9,9 +9,8 @@ import msgspec
 
 from hippodrome.control.lobby import rules, servers_ahead
 from hippodrome.control.lobby.decisions import Decisions
-from hippodrome.control.lobby.lookups import Lookups
 from hippodrome.control.lobby.matcher import Matcher
-from hippodrome.control.lobby.run import StartedAhead
+from hippodrome.control.lobby.run import Lookups, StartedAhead
 from hippodrome.control.lobby.store import LobbyStore
 from hippodrome.control.log import logger
 from hippodrome.control.model import ids

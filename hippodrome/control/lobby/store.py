@@ -14,10 +14,10 @@ from hippodrome.control.lobby.decisions import Decisions, Formed
 from hippodrome.control.lobby.entries import Entries
 from hippodrome.control.log import failure, logger
 from hippodrome.control.model import participant, sessions
-from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.messages import StartServer, to_message
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import to_json
+from hippodrome.control.model.sessions import Membership
 from hippodrome.control.ports import Conflict, Platform, Topic
 from hippodrome.control.storage.compare_and_swap import SharedDocuments
 from hippodrome.control.storage.repository import Repository

@@ -26,9 +26,8 @@ from hippodrome.control.model.balance import (
 from hippodrome.control.model.design import LATIN, Assignment
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import from_json, to_json
-from hippodrome.control.ports import Conflict, Document, Platform
+from hippodrome.control.ports import Conflict, Document, Platform, RetryLater
 from hippodrome.control.servers.sessions import members_of
-from hippodrome.control.storage.errors import RetryLater
 from hippodrome.control.storage.repository import Repository
 from hippodrome.protocol.session import is_session_id
 

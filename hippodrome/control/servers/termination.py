@@ -20,7 +20,7 @@ from hippodrome.control.log import logger
 from hippodrome.control.model import ids, messages, server
 from hippodrome.control.model.messages import StopServer, TaskChanged
 from hippodrome.control.model.server import Reason, Server, ServerState, TaskStopped, next_attempt
-from hippodrome.control.ports import Conflict
+from hippodrome.control.ports import Conflict, RetryLater
 from hippodrome.control.servers import causes
 from hippodrome.control.servers.batches import for_each
 from hippodrome.control.servers.causes import Cause, FailureCategory
@@ -28,7 +28,6 @@ from hippodrome.control.servers.dns import delete_dns_records
 from hippodrome.control.servers.replacement import Replacement
 from hippodrome.control.servers.services import ServerServices
 from hippodrome.control.servers.sessions import Sessions
-from hippodrome.control.storage.errors import RetryLater
 from hippodrome.control.storage.repository import Versioned
 
 I = TypeVar("I")  # noqa: E741 - the item that led to a server: a message or an event

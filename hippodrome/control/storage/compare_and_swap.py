@@ -7,8 +7,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 from hippodrome.control.log import failure
 from hippodrome.control.model.records import Record, from_json, to_json
-from hippodrome.control.ports import Conflict, Documents
-from hippodrome.control.storage.errors import RetryLater
+from hippodrome.control.ports import Conflict, Documents, RetryLater
 
 TRIES = 40  # for one change: twenty functions may start servers of one project at once
 

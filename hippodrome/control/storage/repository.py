@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from hippodrome.control.log import logger
-from hippodrome.control.model import ids, memberships, participant, server
+from hippodrome.control.model import ids, participant, server, sessions
 from hippodrome.control.model.design import Assignment
-from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.participant import Ended, Participant, Progress
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Server
-from hippodrome.control.ports import Conflict, Documents
-from hippodrome.control.storage.errors import RetryLater
+from hippodrome.control.model.sessions import Membership
+from hippodrome.control.ports import Conflict, Documents, RetryLater
 from hippodrome.protocol import session
 from hippodrome.protocol.keys import membership_key, participant_folder, session_key
 from hippodrome.protocol.session import SessionDocument, assignment_key
@@ -121,7 +120,7 @@ class Repository:
         Raises ValueError if the document cannot be read.
         """
         document = self._documents.get(membership_key(project_id, user_id))
-        return memberships.read(document.body) if document else None
+        return sessions.read_membership(document.body) if document else None
 
     def session_id(self, project: Project, user_id: str) -> str | None:
         """Return the id of the session that the participant is a member of; None if there is none.

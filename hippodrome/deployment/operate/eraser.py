@@ -24,10 +24,11 @@ from typing import Any, NamedTuple, Protocol
 from hippodrome.control.limits.rules import ParticipantSlots, participant_slots_folder
 from hippodrome.control.lobby import decisions, entries, rules
 from hippodrome.control.lobby.decisions import Decisions
-from hippodrome.control.model import ids, memberships, server
+from hippodrome.control.model import ids, server
 from hippodrome.control.model.balance import Cells, cells_key
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Server
+from hippodrome.control.model.sessions import read_membership
 from hippodrome.deployment.aws.object_version import Version
 from hippodrome.deployment.core.server_records import keys_of_warm_servers, warm_servers_of
 from hippodrome.export import without_member
@@ -146,7 +147,7 @@ class Eraser:
 
     def _membership(self) -> FoundSession | None:
         try:
-            membership = memberships.read(self._body(membership_key(self.project, self.user)))
+            membership = read_membership(self._body(membership_key(self.project, self.user)))
         except ValueError:
             return None
         return FoundSession(membership.session, membership.seat, others=True) if membership.session else None

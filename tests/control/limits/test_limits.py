@@ -26,9 +26,8 @@ from hippodrome.control.model.messages import StartServer, StopServer, TaskChang
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import from_json
 from hippodrome.control.model.server import Reason, Server, ServerState
-from hippodrome.control.ports import Conflict, Documents, NoCapacity, Refused, Topic
+from hippodrome.control.ports import Conflict, Documents, NoCapacity, Refused, RetryLater, Topic
 from hippodrome.control.servers.sweep import Sweep
-from hippodrome.control.storage.errors import RetryLater
 from hippodrome.local.backend.documents import FolderDocuments
 from testing.fake_platform import FakePlatform
 from testing.moto_world import MotoWorld

@@ -13,8 +13,8 @@ from hippodrome.control.lobby import entries as folder
 from hippodrome.control.lobby.decisions import Decisions, OpenSession
 from hippodrome.control.lobby.lobby import LobbyState
 from hippodrome.control.model import ids, sessions
-from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.records import to_json
+from hippodrome.control.model.sessions import Membership
 from hippodrome.control.ports import Entry, Topic
 from hippodrome.protocol.keys import membership_key
 from testing.port_faults import PortFault

@@ -15,12 +15,12 @@ from hippodrome.control.lobby import entries as folder
 from hippodrome.control.lobby.decisions import Decisions
 from hippodrome.control.lobby.lobby import Lobby, LobbyState, NoServerYet
 from hippodrome.control.model import ids
-from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.messages import StartServer
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import ServerState, new_attempt
 from hippodrome.control.model.server import key as server_key
+from hippodrome.control.model.sessions import Membership
 from hippodrome.control.ports import Topic
 from hippodrome.control.storage.repository import Repository
 from hippodrome.protocol.session import SessionDocument

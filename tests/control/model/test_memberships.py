@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from hippodrome.control.model.memberships import Membership, read
 from hippodrome.control.model.records import to_json
+from hippodrome.control.model.sessions import Membership, read_membership
 
 SESSION = "s." + "0" * 20
 
@@ -15,13 +15,13 @@ SESSION = "s." + "0" * 20
     Membership(unmatched=True, completion_code="ABC", waited=300.0),
 ])  # fmt: skip
 def test_a_membership_is_read_as_it_was_written(membership: Membership) -> None:
-    assert read(to_json(membership)) == membership
+    assert read_membership(to_json(membership)) == membership
 
 
 def test_a_document_of_an_earlier_version_has_neither_a_code_nor_a_time() -> None:
-    found = read(b'{"unmatched": true}')
+    found = read_membership(b'{"unmatched": true}')
     assert (found.session, found.seat, found.members, found.completion_code, found.waited) == (None, 0, 0, "", None)
-    assert read(b'{"session": "%b", "seat": 1}' % SESSION.encode()) == Membership(SESSION, 1)
+    assert read_membership(b'{"session": "%b", "seat": 1}' % SESSION.encode()) == Membership(SESSION, 1)
 
 
 @pytest.mark.parametrize("body", [
@@ -30,4 +30,4 @@ def test_a_document_of_an_earlier_version_has_neither_a_code_nor_a_time() -> Non
 ])  # fmt: skip
 def test_a_document_that_says_neither_or_both_is_refused(body: bytes) -> None:
     with pytest.raises(ValueError):
-        read(body)
+        read_membership(body)

@@ -13,8 +13,8 @@ from hippodrome.control.http import Response
 from hippodrome.control.log import logger
 from hippodrome.control.model import ids
 from hippodrome.control.model.design import Step
-from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.place import values_of
+from hippodrome.control.model.sessions import Membership
 from hippodrome.control.participants import frame, pages
 from hippodrome.control.participants.forms import PostedForm, Showing
 from hippodrome.control.participants.page_error import CONTENT_NOT_FOUND, PageError, program_message

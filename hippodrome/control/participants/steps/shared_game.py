@@ -13,9 +13,9 @@ import msgspec
 from hippodrome.control.lobby.lobby import Lobby, LobbyState, NoServerYet
 from hippodrome.control.model import participant
 from hippodrome.control.model.design import Step
-from hippodrome.control.model.memberships import Membership
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Server, ServerState
+from hippodrome.control.model.sessions import Membership
 from hippodrome.control.participants.pages import LOBBY
 from hippodrome.control.participants.services import Services
 from hippodrome.control.participants.visit import Visit

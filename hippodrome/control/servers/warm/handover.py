@@ -15,9 +15,8 @@ from hippodrome.control.model import ids, server
 from hippodrome.control.model.messages import StopServer, to_message
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Reason, Server, ServerState
-from hippodrome.control.ports import Conflict, Platform
+from hippodrome.control.ports import Conflict, Platform, RetryLater
 from hippodrome.control.servers.warm.pools import Pools
-from hippodrome.control.storage.errors import RetryLater
 from hippodrome.control.storage.repository import Repository, Versioned
 from hippodrome.protocol.handover import Handover
 from hippodrome.protocol.keys import handover_key

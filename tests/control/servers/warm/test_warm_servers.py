@@ -17,10 +17,9 @@ from hippodrome.control.model.project import MASTER_LIST, MasterList, Project
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Reason, Server, ServerState
 from hippodrome.control.model.warm_pool import Pool
-from hippodrome.control.ports import NoCapacity, Refused, Topic
+from hippodrome.control.ports import NoCapacity, Refused, RetryLater, Topic
 from hippodrome.control.servers.sweep import Sweep
 from hippodrome.control.servers.warm.pools import Pools
-from hippodrome.control.storage.errors import RetryLater
 from hippodrome.control.storage.project_cache import ProjectCache
 from hippodrome.control.storage.repository import Repository
 from hippodrome.control.storage.secret import SecretCache
