@@ -116,7 +116,8 @@ def test_erasing_a_member_removes_from_a_real_recording_what_is_theirs_alone(
     theirs, ours = entries_of_one_player(store, other), entries_of_one_player(store, mine)
     assert {"presence", "callback"} <= {each["kind"] for each in ours if isinstance(each, dict) and "kind" in each}
     assert {"key", "command", "action"} & {name for each in ours if isinstance(each, dict) for name in each}
-    assert main(["erase", user, "study", "--from", str(store), "--yes"]) == Exit.DONE
+    receipt = ["--receipt", str(tmp_path / "receipt.json")]
+    assert main(["erase", user, "study", "--from", str(store), "--yes", *receipt]) == Exit.DONE
     assert entries_of_one_player(store, mine) == []
     assert entries_of_one_player(store, other) == theirs
     (left,) = recordings(store).values()

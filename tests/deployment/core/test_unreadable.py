@@ -175,11 +175,13 @@ def test_erase_names_unreadable_documents_and_goes_on(
     add_broken_entry(world)
     world.register(study(max_participants=16))
     world.participant(USER, answered=2)
-    world.put("maze/slots/3.json", b"[")
+    world.put("maze/slots/3.json", f'["{ids.server_label("maze", USER)}'.encode())
+    world.put("maze/slots/4.json", b"[")  # names nobody
     ran = world.run(capsys, "erase", USER, "maze", "--yes")
     assert ran.code == Exit.DONE, ran.err
     assert not [key for key in world.keys("maze/users/") if USER in key]
-    assert "maze/slots/3.json cannot be read" in " ".join(ran.err.split())
+    assert "maze/slots/3.json in hippodrome cannot be read" in " ".join(ran.err.split())
+    assert "maze/slots/4.json" not in ran.err
 
 
 @pytest.mark.parametrize(("project", "warned"), [("maze", False), ("broken", True)])
