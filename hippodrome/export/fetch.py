@@ -1,303 +1,367 @@
-"""Fetches new and changed files (`listing.py`) from the source into the folder, for several participants at once.
+"""Fetches new and changed files from the source into the folder, for several participants at once.
 
-A file appears under its name whole or not at all, and only then the state records it. So an interrupted run can be
-continued.
+A file appears under its name whole or not at all, and only then a record (`records.py`) names it. So an interrupted run
+can be continued.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 import os
-import time
+import signal
+import threading
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from hippodrome.export import keys, recording, scrub, talk
-from hippodrome.export.interruption import interruption
+from hippodrome.export import keys, manifest, recording, scrub, talk
 from hippodrome.export.keys import Item, KeyKind
-from hippodrome.export.listing import Members, Tally, Unit, Wanted, choose, lines, members, units, version_of
-from hippodrome.export.recording_columns import when
+from hippodrome.export.manifest import ExportedFile
+from hippodrome.export.records import PRIVATE, Record, Records, SourceFile
 from hippodrome.export.source import PARALLEL, FileGone, Source, TooLarge
-from hippodrome.export.state import ExportedFile, ExportedParticipant, ExportState, SourceFile
+from hippodrome.export.values import when
 from hippodrome.protocol import session as sessions
+from hippodrome.protocol.keys import sessions_folder
 from hippodrome.protocol.session import is_session_id
 
 MAX_WAITING = 4 * PARALLEL  # participants and sessions whose files are being fetched
-COMMIT_EVERY = 2  # seconds; after a power cut, the work of these seconds may have to be repeated
+CONVERTED_AT_ONCE = 1
 MAX_PIECE = 256 * 1024 * 1024  # bytes; a piece holds what was said, and a model's answers, of two seconds
 MAX_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step accepts answers of 256 KB
+_PLAYED = (KeyKind.RECORDING, KeyKind.TAPE)
+
+
+class Wanted(NamedTuple):
+    """The data that a run fetches."""
+
+    recordings: bool = True
+    raw: bool = False  # whether the source's files are also copied unchanged
+    apart: bool = False  # whether ids are kept apart, in `private/`
+    dry: bool = False  # whether files are only counted
 
 
 @dataclass
-class Work:
-    """The files of one participant or one session that a worker fetches."""
+class Tally:
+    """What a run has done, or would do: numbers of participants, files and bytes."""
 
-    user: str  # the id of the participant or of the session; "" for files of neither
-    owner: ExportedParticipant | Members | None
-    fetch: list[Item]
-    unchanged: list[str]  # keys
-    then: Unit | None = None  # the session's other files, which are fetched after its document is read
+    participants: int = 0
+    new: int = 0
+    changed: int = 0
+    unchanged: int = 0
+    gone: int = 0  # files that are no longer in the source
+    bytes: int = 0  # the bytes to fetch
+    damaged: int = 0  # files in the folder that have changed or are missing
+
+    @property
+    def to_fetch(self) -> int:
+        return self.new + self.changed
+
+    def add(self, other: Tally) -> None:
+        for one in fields(self):
+            setattr(self, one.name, getattr(self, one.name) + getattr(other, one.name))
+
+
+class Played(NamedTuple):
+    """Who has played a recording. `people` has a session's members: their numbers, by seat.
+
+    `identities` has the texts that identify them, each with its replacement. `mark` changes with both, so that
+    recordings are converted again.
+    """
+
+    identities: Mapping[str, str]
+    people: Mapping[int, str] | None = None
+
+    @property
+    def mark(self) -> str:
+        facts = json.dumps([sorted((self.people or {}).items()), sorted(self.identities.items())])
+        return hashlib.blake2b(facts.encode("utf-8", "replace"), digest_size=8).hexdigest()
 
 
 class Fetcher:
-    """Fetches and converts files with several workers. `progress` is called with the number of listed files, and how
-    many of them are done. `damaged` are paths in the folder whose files have changed or are missing."""
+    """Fetches and converts files with several workers."""
 
-    def __init__(
-        self,
-        project: str,
-        *,
-        source: Source,
-        state: ExportState,
-        folder: Path,
-        wanted: Wanted,
-        progress: Callable[[int, int], None],
-        damaged: frozenset[str],
-    ) -> None:
+    def __init__(self, project: str, source: Source, *, records: Records, folder: Path, wanted: Wanted) -> None:
         self._project = project
         self._source = source
-        self._state = state
+        self._records = records
         self._folder = folder
         self._wanted = wanted
-        self._progress = progress
-        self._damaged = damaged
-        self._listed = self._done = 0
-        self.incoming = folder / "private" / "incoming"
+        self._seen: set[str] = set()  # the names of the records of those who have files in the source
+        self._converter = ThreadPoolExecutor(1)  # of several threads each would keep a recording's memory
+        self.incoming = folder / PRIVATE / "incoming"
 
-    def run(self) -> Tally:
-        """Bring the folder up to date, and return what was done. If this raises, the state has the files so far."""
+    def run(self, progress: Callable[[int, int], None]) -> Tally:
+        """Bring the folder up to date, and return what was done. `progress` is called with the number of listed files,
+        and how many of them are done. If this raises, the records have the files so far."""
+        if not self._wanted.dry:
+            self.incoming.mkdir(parents=True, exist_ok=True)
+            for left in self.incoming.iterdir():
+                left.unlink()
         tally = Tally()
-        self.incoming.mkdir(parents=True, exist_ok=True)
-        for left in self.incoming.iterdir():
-            left.unlink()
-        self._state.begin_run()
-        with self._state.in_transactions() as commit, interruption() as check:
-            self._all(tally, commit, check)
+        pool = ThreadPoolExecutor(PARALLEL, thread_name_prefix="data")
+        running: dict[Future[Tally], int] = {}
+        listed = done = 0
+        try:
+            with interruption() as check:
+
+                def collect(most: int) -> None:
+                    """Wait until at most so many participants and sessions are being fetched."""
+                    nonlocal done
+                    while len(running) > most:
+                        check()
+                        for future in wait(running, timeout=0.2, return_when=FIRST_COMPLETED).done:
+                            done += running.pop(future)
+                            tally.add(future.result())
+                        progress(listed, done)
+
+                for user, items in self._units():
+                    if not user or is_session_id(user):
+                        collect(0)  # a session's recordings name its members, whose documents must be known first
+                    record = self._records.of(user)
+                    self._seen.add(record.folder)
+                    listed += len(items)
+                    running[pool.submit(self._update, record, items)] = len(items)
+                    collect(MAX_WAITING)
+                collect(0)
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+            self._converter.shutdown()
         return tally
 
-    def _all(self, tally: Tally, commit: Callable[[], None], check: Callable[[], None]) -> None:
-        """Fetch and save all files. `check` is called often, and may raise KeyboardInterrupt."""
-        running: dict[Future[list[SourceFile]], Work] = {}
-        committed = time.monotonic()
-        pool = ThreadPoolExecutor(PARALLEL, thread_name_prefix="data")
+    def _units(self) -> Iterator[tuple[str, list[Item]]]:
+        """The listed files of each participant, then those of each session, then those of neither."""
+        strays: list[Item] = []
+        for prefix in (keys.prefix(self._project), sessions_folder(self._project)):
+            items = (keys.read(self._project, line) for line in self._source.list(prefix))
+            for user, group in itertools.groupby(items, key=lambda item: item.user):
+                if user:
+                    yield user, list(group)
+                else:
+                    strays += group
+        if strays:
+            yield "", strays
 
-        def begin(work: Work) -> None:
-            if work.fetch:
-                running[pool.submit(self._fetch, work)] = work
-            else:
-                self._save(work, [])
-                follow(work)
-
-        def follow(work: Work) -> None:
-            if work.then is not None:
-                begin(self._work(work.then, tally, members(self._state, work.then.user)))
-
-        def collect() -> None:
-            for work in self._collect(running, check):
-                follow(work)
-
-        try:
-            for unit in units(self._project, lines(self._source, self._project, self._state)):
-                while unit.is_session and any(isinstance(work.owner, ExportedParticipant) for work in running.values()):
-                    collect()  # the participants of a session must be known first
-                check()
-                begin(self._work(unit, tally))
-                while len(running) >= MAX_WAITING:
-                    collect()
-                if time.monotonic() - committed > COMMIT_EVERY:
-                    commit()
-                    committed = time.monotonic()
-            while running:
-                collect()
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            for future, work in running.items():
-                if future.done() and not future.cancelled() and future.exception() is None:
-                    self._save(work, future.result())
-            raise
-        pool.shutdown()
-
-    def _work(self, unit: Unit, tally: Tally, known: Members | None = None) -> Work:
-        """The work for a unit. A session has two: first its document alone; its other files once its members are
-        `known`."""
-        owner: ExportedParticipant | Members | None = known
-        then = None
-        if unit.is_session and known is None:
-            document = [item for item in unit.items if item.kind is KeyKind.SESSION]
-            others = [item for item in unit.items if item.kind is not KeyKind.SESSION]
-            owner, unit, then = Members(unit.user), Unit(unit.user, document), Unit(unit.user, others)
-        elif unit.user and known is None:
-            owner = self._state.find_or_add(unit.user, self._wanted.apart)
-        mark = known.mark if known else ""
-        fetch, unchanged = choose(self._state, unit, self._wanted, tally, self._damaged, mark=mark)
-        self._listed += len(unit.items)
-        self._done += len(unchanged)
-        self._progress(self._listed, self._done)
-        return Work(unit.user, owner, fetch, unchanged, then)
-
-    def _collect(self, running: dict[Future[list[SourceFile]], Work], check: Callable[[], None]) -> list[Work]:
-        done: set[Future[list[SourceFile]]] = set()
-        while not done:
-            check()
-            done, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
-        collected = []
-        for future in done:
-            files = future.result()  # `result` may raise; then `_all` saves the results of the other workers
-            work = running.pop(future)
-            self._save(work, files)
-            self._done += len(work.fetch)
-            collected.append(work)
-        self._progress(self._listed, self._done)
-        return collected
-
-    def _save(self, work: Work, files: list[SourceFile]) -> None:
-        """Save the files in the state, and remove their earlier versions from the folder."""
-        before = self._state.files_of(work.user) if files else {}
-        self._state.save(work.user, work.unchanged, files)
-        for file in files:
-            old = before.get(file.key)
-            for path, now in ((old.path, file.made), (old.raw, file.raw)) if old else ():
-                if path and (now is None or now.path != path):
-                    (self._folder / path).unlink(missing_ok=True)
+    def forget_gone(self) -> int:
+        """Remove those who have no file in the source any more, such as an erased participant; return how many files
+        they had."""
+        count = 0
+        for name in self._records.names - self._seen:
+            record = self._records.load(name)
+            count += len(record.files) if record else 0
+            if not self._wanted.dry:
+                for file in record.files.values() if record else ():
+                    self._remove(file)
+                self._records.remove(name)
+        return count
 
     # -- in the workers
 
-    def _fetch(self, work: Work) -> list[SourceFile]:
-        made = []
-        owner = work.owner
-        for item in work.fetch:  # participant.json comes first
-            mark = owner.mark if isinstance(owner, Members) else ""
-            file = SourceFile(item.listed.key, item.kind, version_of(item, mark), item.listed.size, step=item.step)
-            try:
-                if item.kind is KeyKind.FOREIGN or owner is None:
-                    file.problems.append(f"no file of Hippodrome: {item.why}")
-                elif item.kind is KeyKind.RECORDING:
-                    self._recording(item, owner, file)
-                elif item.kind is KeyKind.TAPE:
-                    self._tape(item, owner, file)
-                else:
-                    self._document(item, owner, file)
-            except FileGone:
-                continue  # the next run lists its new version, if there is one
-            if isinstance(owner, ExportedParticipant):  # the participant's later files are read with what these say
-                if item.kind is KeyKind.PARTICIPANT:
-                    owner = owner._replace(document=file.document or {})
-                elif item.kind is KeyKind.MEMBERSHIP:
-                    owner = owner._replace(membership=file.document or {})
-            made.append(file)
-        return made
+    def _update(self, record: Record, items: list[Item]) -> Tally:
+        """Fetch what is new or changed of one participant or session, and remove what the source has lost."""
+        tally = Tally(participants=int(record.is_participant))
+        lost = record.files.keys() - {item.listed.key for item in items}
+        for key in lost:
+            tally.gone += 1
+            file = record.files.pop(key)
+            if not self._wanted.dry:
+                self._remove(file)
+        documents = [item for item in items if item.kind not in _PLAYED]
+        stale = [item for item in documents if not self._is_current(record, item, item.listed.version, tally)]
+        for item in stale:
+            self._fetch(record, item, SourceFile(item.listed.key, item.kind, item.listed.version, item.step))
+        if (lost or stale) and not self._wanted.dry:
+            self._records.save(record)
+        played = self._played(record)
+        mark = f"~{played.mark}"
+        if self._wanted.dry and any(item.kind not in (KeyKind.ANSWER, KeyKind.FOREIGN) for item in stale):
+            mark = ""  # it is not known yet
+        for item in (item for item in items if item.kind in _PLAYED):
+            version = f"{item.listed.version}{mark}"
+            if not self._is_current(record, item, version, tally):
+                file = SourceFile(item.listed.key, item.kind, version, item.step)
+                self._fetch(record, item, file, played)
+                if not self._wanted.dry:
+                    self._records.save(record)
+        return tally
 
-    def _document(self, item: Item, owner: ExportedParticipant | Members, file: SourceFile) -> None:
+    def _is_current(self, record: Record, item: Item, version: str, tally: Tally) -> bool:
+        """Whether a file need not be fetched. Counts it."""
+        before = record.files.get(item.listed.key)
+        damaged = [file for file in before.exported if manifest.difference(self._folder, file)] if before else []
+        tally.damaged += len(damaged)
+        raw_missing = self._wanted.raw and item.kind is not KeyKind.FOREIGN and not (before and before.raw)
+        skipped = item.kind in _PLAYED and not self._wanted.recordings
+        if skipped or (before and before.version == version and not damaged and not raw_missing):
+            tally.unchanged += 1
+            return True
+        if before:
+            tally.changed += 1
+        else:
+            tally.new += 1
+        tally.bytes += item.listed.size if item.kind is not KeyKind.FOREIGN else 0
+        return False
+
+    def _played(self, record: Record) -> Played:
+        """Who has played the recordings of a participant or session."""
+        if not record.is_session:
+            return Played(scrub.identities(record) if self._wanted.apart and record.user else {})
+        people: dict[int, str] = {}
+        identities: dict[str, str] = {}
         try:
-            body = self._source.read(item.listed.key, MAX_DOCUMENT)
-        except TooLarge:
-            file.problems.append(f"it is larger than {MAX_DOCUMENT:,} bytes and was not read")
+            members = sessions.parse(json.dumps(record.session).encode()).members
+        except sessions.BadSession:
+            members = ()
+        for member in members:
+            theirs = self._records.of(member.user_id) if member.user_id else None
+            if theirs and theirs.folder in self._seen:
+                people[member.seat] = theirs.number
+                identities |= scrub.identities(theirs) if self._wanted.apart else {}
+        return Played(identities, people)
+
+    def _fetch(self, record: Record, item: Item, file: SourceFile, played: Played | None = None) -> None:
+        """Fetch a file, and put it into the record in the place of its earlier version."""
+        if self._wanted.dry:
             return
-        if self._wanted.raw:
-            parts = item.listed.key.split("/")[3:]
-            file.raw = self._put(body, f"private/raw/{'/'.join([_folder(owner), *parts])}")
         try:
-            found = json.loads(body)
+            if item.kind is KeyKind.FOREIGN:
+                file.problems.append(f"no file of Hippodrome: {item.why}")
+            elif played is None:
+                self._document(record, item, file)
+            elif item.kind is KeyKind.RECORDING:
+                self._recording(record, item, file, played)
+            else:
+                self._tape(record, item, file, played)
+        except FileGone:
+            return  # the next run lists its new version, if there is one
+        if before := record.files.get(file.key):
+            self._remove(before, but=[now.path for now in file.exported])
+        record.files[file.key] = file
+
+    def _document(self, record: Record, item: Item, file: SourceFile) -> None:
+        rest = "/".join(item.listed.key.split("/")[3:])
+        body = self._read(item, file, f"private/raw/{record.folder}/{rest}", MAX_DOCUMENT)
+        if body is None:
+            return
+        try:
+            document = json.loads(body)
         except (ValueError, RecursionError):
             file.problems.append("it is no JSON")
             return
-        if not isinstance(found, dict):
+        if isinstance(document, dict):
+            file.document = document
+            file.problems += doubts(item, document)
+        else:
             file.problems.append("it is no JSON object")
-            return
-        file.document = found
-        file.problems += _doubts(item, found)
 
-    def _tape(self, item: Item, owner: ExportedParticipant | Members, file: SourceFile) -> None:
-        try:
-            body = self._source.read(item.listed.key, MAX_PIECE)
-        except TooLarge:
-            file.problems.append(f"it is larger than {MAX_PIECE:,} bytes and was not read")
+    def _tape(self, record: Record, item: Item, file: SourceFile, played: Played) -> None:
+        raw = f"private/raw/{record.folder}/trials/{item.server}/{item.name}"
+        body = self._read(item, file, raw, MAX_PIECE)
+        if body is None:
             return
-        if self._wanted.raw:
-            file.raw = self._put(body, f"private/raw/{_folder(owner)}/trials/{item.server}/{item.name}")
-        identities = scrub.identities(owner) if isinstance(owner, ExportedParticipant) else dict(owner.identities)
-        hide = scrub.Scrub(identities if self._wanted.apart else {})
         attempt = keys.attempt(self._project, item.user, item.server)
-        where: dict[str, Any] = {"step": item.step, "attempt": attempt, "session": None}
-        people: Mapping[int, str] = {}
-        if isinstance(owner, Members):
-            where["session"], people = owner.session, owner.people
+        where = {"step": item.step, "attempt": attempt, "session": record.user if record.is_session else None}
         try:
-            file.document = talk.document(json.loads(body), where, people, hide)
+            hide = scrub.Scrub(played.identities)
+            file.document = talk.document(json.loads(body), where, played.people or {}, hide)
         except (ValueError, AttributeError, RecursionError):
             file.problems.append("it is no piece of a tape that this version can read")
 
-    def _recording(self, item: Item, owner: ExportedParticipant | Members, file: SourceFile) -> None:
+    def _read(self, item: Item, file: SourceFile, raw: str, most: int) -> bytes | None:
+        """Read a document, and keep it at the path `raw` too if that is wanted; None if it is too large."""
+        try:
+            body = self._source.read(item.listed.key, most)
+        except TooLarge:
+            file.problems.append(f"it is larger than {most:,} bytes and was not read")
+            return None
+        if self._wanted.raw:
+            copy = self._temporary()
+            copy.write_bytes(body)
+            file.raw = self._move(copy, raw)
+        return body
+
+    def _recording(self, record: Record, item: Item, file: SourceFile, played: Played) -> None:
         attempt = keys.attempt(self._project, item.user, item.server)
         place = str(attempt) if attempt is not None else f"other-{self._token(item.server)}"
-        if isinstance(owner, ExportedParticipant):
-            column, identities, people = {"participant": owner.number}, scrub.identities(owner), None
-        else:
-            column, identities, people = {"session": owner.session}, dict(owner.identities), owner.people
-        folder, label = _folder(owner), item.server.rpartition("-")[0]
+        label = item.server.rpartition("-")[0]
         servers = {item.server: place} | ({label: "(server)"} if label else {})
-        hide = scrub.Scrub(identities, servers) if self._wanted.apart else scrub.Scrub({})
+        hide = scrub.Scrub(played.identities, servers if self._wanted.apart else {})
+        owner = {"session": record.user} if record.is_session else {"participant": record.number}
+        constants = {**owner, "studyStep": item.step, "attempt": attempt}
         packed, made = self._temporary(), self._temporary()
         try:
             self._source.fetch(item.listed, packed)
-            constants = {**column, "studyStep": item.step, "attempt": attempt}
-            converted = recording.convert(packed, made, constants, hide, shown=not self._wanted.apart, people=people)
-            path = f"recordings/{folder}/{place}/{item.name}.parquet"
-            file.made = self._move(made, path)
+            shown = not self._wanted.apart
+            convert = partial(recording.convert, packed, made, constants, hide, shown=shown, people=played.people)
+            converted = self._converter.submit(convert).result()
+            file.made = self._move(made, f"recordings/{record.folder}/{place}/{item.name}.parquet")
             if self._wanted.raw:
-                file.raw = self._move(packed, f"private/raw/{folder}/trials/{item.server}/{item.name}.jsonl.gz")
+                raw = f"private/raw/{record.folder}/trials/{item.server}/{item.name}.jsonl.gz"
+                file.raw = self._move(packed, raw)
         finally:
             packed.unlink(missing_ok=True)
             made.unlink(missing_ok=True)
         file.frames, file.problems = converted.frames, converted.problems
-        file.episodes += [{**episode, "step": item.step, "attempt": attempt} for episode in converted.episodes]
+        file.episodes = [{**episode, "step": item.step, "attempt": attempt} for episode in converted.episodes]
 
     def _token(self, server: str) -> str:
         """A token in the place of a server's name that Hippodrome has not made, and that may identify someone."""
-        salt = (self._folder / "private" / "salt").read_bytes()
+        salt = (self._folder / PRIVATE / "salt").read_bytes()
         return hashlib.blake2b(server.encode(), key=salt, digest_size=5).hexdigest()
 
     def _temporary(self) -> Path:
         return self.incoming / f"{uuid.uuid4().hex}.part"
 
-    def _put(self, body: bytes, path: str) -> ExportedFile:
-        written = self._temporary()
-        written.write_bytes(body)
-        return self._move(written, path)
-
     def _move(self, file: Path, path: str) -> ExportedFile:
         """Move a finished file to its path in the folder."""
-        size, digest = file.stat().st_size, sha256(file)
         target = self._folder / path
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(file, target)
-        return ExportedFile(path, size, digest)
+        return manifest.entry(self._folder, target)
+
+    def _remove(self, file: SourceFile, but: list[str] | None = None) -> None:
+        """Remove a source file's exported files, except those with the paths in `but`, and the folders that are empty
+        then."""
+        for exported in file.exported:
+            if exported.path not in (but or ()):
+                path = self._folder / exported.path
+                path.unlink(missing_ok=True)
+                remove_empty(path.parent, self._folder)
 
 
-def _folder(owner: ExportedParticipant | Members) -> str:
-    """The name of a participant's or a session's folder in the export folder."""
-    return owner.folder if isinstance(owner, ExportedParticipant) else owner.session
+@contextlib.contextmanager
+def interruption() -> Iterator[Callable[[], None]]:
+    """Let Ctrl-C raise KeyboardInterrupt only where the block calls the function that this yields.
 
+    Elsewhere it may break a lock that the workers share, and they then print tracebacks or wait for ever. A second
+    Ctrl-C raises it at once. Nothing changes in a thread other than the main thread, or if Ctrl-C is ignored.
+    """
+    pressed: list[int] = []
 
-def forget_gone(state: ExportState, folder: Path) -> int:
-    """Remove the files that the source does not have any more, such as the files of an erased participant; return how
-    many there were."""
-    count = 0
-    with state.in_transactions():
-        for key, user, kind, path, raw in state.unseen():
-            for old in filter(None, (path, raw)):
-                (folder / old).unlink(missing_ok=True)
-                remove_empty((folder / old).parent, folder)
-            state.forget(key, user, kind)
-            count += 1
-        state.forget_participants()
-    return count
+    def check() -> None:
+        if pressed:
+            raise KeyboardInterrupt
+
+    def press(number: int, _: object) -> None:
+        check()
+        pressed.append(number)
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
+        yield check
+        return
+    signal.signal(signal.SIGINT, press)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)
+    check()
 
 
 def remove_empty(empty: Path, top: Path) -> None:
@@ -308,39 +372,32 @@ def remove_empty(empty: Path, top: Path) -> None:
             empty = empty.parent
 
 
-def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file, in hex digits."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _doubts(item: Item, found: dict[str, Any]) -> list[str]:
-    """The differences between a document and its description in `docs/data.md`. The export uses the valid parts."""
+def doubts(item: Item, found: dict[str, Any]) -> list[str]:
+    """Return the differences between a document and its description in `docs/data.md`. The export uses the valid
+    parts."""
     doubts = []
     group = found.get("group")
     if group is not None and (not isinstance(group, int) or isinstance(group, bool)):
         doubts.append("group is no whole number")
-    if item.kind is KeyKind.PARTICIPANT:
-        if when(found.get("arrived")) is None:
-            doubts.append("arrived is no time")
-        if not isinstance(found.get("link", {}), dict):
-            doubts.append("link is no object")
-        return doubts
-    if item.kind is KeyKind.MEMBERSHIP:
-        session = found.get("session")
-        return doubts if session is None or is_session_id(session) else [*doubts, "session is no id of a session"]
-    if item.kind is KeyKind.SESSION:
-        try:
-            sessions.parse(json.dumps(found).encode())
-        except sessions.BadSession as bad:
-            doubts.append(str(bad))
-        return doubts
-    if item.step in (keys.ASSIGNED, keys.ENDED):
-        return doubts
-    if not isinstance(found.get("answers"), dict):
-        doubts.append("answers is no object")
-    if when(found.get("answered")) is None:
-        doubts.append("answered is no time")
-    if found.get("step") != item.step.partition(".")[0]:
-        doubts.append("step is not the one in the file's name")
+    match item.kind:
+        case KeyKind.PARTICIPANT:
+            if when(found.get("arrived")) is None:
+                doubts.append("arrived is no time")
+            if not isinstance(found.get("link", {}), dict):
+                doubts.append("link is no object")
+        case KeyKind.MEMBERSHIP:
+            if (session := found.get("session")) is not None and not is_session_id(session):
+                doubts.append("session is no id of a session")
+        case KeyKind.SESSION:
+            try:
+                sessions.parse(json.dumps(found).encode())
+            except sessions.BadSession as bad:
+                return [str(bad)]
+        case KeyKind.ANSWER if item.step not in (keys.ASSIGNED, keys.ENDED):
+            if not isinstance(found.get("answers"), dict):
+                doubts.append("answers is no object")
+            if when(found.get("answered")) is None:
+                doubts.append("answered is no time")
+            if found.get("step") != item.step.partition(".")[0]:
+                doubts.append("step is not the one in the file's name")
     return doubts

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hippodrome.export.recording_columns import unpack_array
+from hippodrome.export.recording import unpack_array
 from hippodrome.export.scrub import clean
 
 Kind = tuple[Any, ...]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import errno
 import itertools
+import json
 import os
 import secrets
 import shutil
-import sqlite3
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -17,22 +17,25 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from hippodrome.console import screen
 from hippodrome.console.problem import Problem
-from hippodrome.control.model.project import MASTER_LIST, Project, read_list
-from hippodrome.export import calls, fetch, keys, listing, manifest, runs, table_files, tables, talk
-from hippodrome.export.answers import StudyAnswers
-from hippodrome.export.fetch import Fetcher
-from hippodrome.export.listing import Tally, Wanted
+from hippodrome.control.model.project import MASTER_LIST, MasterList, Project, read_list
+from hippodrome.export import keys, manifest
+from hippodrome.export.answers import Answers, LongAnswers, Runs, Tries
+from hippodrome.export.fetch import Fetcher, Tally, Wanted
+from hippodrome.export.keys import KeyKind
+from hippodrome.export.manifest import ExportedFile
 from hippodrome.export.page_fields import read_fields
+from hippodrome.export.records import IDENTITIES, PRIVATE, Record, Records
 from hippodrome.export.source import FileGone, Source, TooLarge
-from hippodrome.export.state import ExportedFile, ExportState
+from hippodrome.export.table_files import Style, Table, TableFile
+from hippodrome.export.tables import Callbacks, Episodes, Identities, Presence, Problems
+from hippodrome.export.talk import Calls, Messages
 
-PRIVATE = "private"
-_STATE = f"{PRIVATE}/state.sqlite"
-_DATASETS = 1  # raised with what datasets hold: those with another number are made again
+_ABOUT = f"{PRIVATE}/about.json"  # what all runs of a folder have in common
+_GAMES = ("episodes", "callbacks", "messages", "calls", "presence")
+_TABLES = ("answers", "answers-long", "runs", "runs-*", "tries", "problems", *_GAMES)
+_COUNTED = ("participants", "answers", "recordings", "episodes", "frames", "foreign", "finished", "problems")
 _MAX_MASTER_LIST = 64 * 1024 * 1024  # bytes
 
 
@@ -51,90 +54,32 @@ class Options:
         """The data to fetch: recordings only if a format needs them."""
         return Wanted(bool(self.formats & {"parquet", "minari"}), self.raw, self.apart)
 
+    @property
+    def style(self) -> Style:
+        """The formats of tables. If datasets are the only format, tables are CSV."""
+        parquet = "parquet" in self.formats
+        return Style("csv" in self.formats or not parquet, parquet, self.spreadsheet)
 
-def _with_those_here(folder: Path, options: Options) -> Options:
-    """Add the formats that the folder has from earlier runs: another format removes none, and none goes out of date.
-
-    Formats whose packages are not installed are left out.
-    """
-    here = {name for name in ("csv", "parquet") if (folder / f"answers.{name}").exists()}
-    here |= {"minari"} if (folder / "minari").is_dir() else set()
-    missing = {name for name, package in (("parquet", "pyarrow"), ("minari", "minari")) if find_spec(package) is None}
-    long = options.long or any(folder.glob("answers-long.*"))
-    return replace(options, formats=options.formats | (here - missing), long=long)
-
-
-def find_project(source: Source, project_id: str) -> Project | None:
-    """Return the registered study, which has the order of its steps; None if it cannot be read, or is not there."""
-    try:
-        listed = read_list(source.read(MASTER_LIST, _MAX_MASTER_LIST))
-    except FileGone:
-        return None
-    except (TooLarge, ValueError):
-        screen.warning(f"{MASTER_LIST} cannot be read: steps stand in the order of their names.")
-        return None
-    found = listed.find(project_id)
-    if found is None and any(entry.id in (None, project_id) for entry in listed.unreadable):
-        screen.warning(f"An entry of {MASTER_LIST} cannot be read, maybe this project's: steps stand by their names.")
-    return found
-
-
-def _refuse_unknown(source: Source, project_id: str, folder: Path, project: Project | None) -> None:
-    """Raise `Problem` if a new folder would be filled from a source that holds no participant of this project."""
-    if (folder / _STATE).exists() or any(True for _ in source.list(keys.prefix(project_id))):
-        return
-    if project:
-        raise Problem(f"No participant has begun {project_id} yet.", f"Answers will be in the {source.where}.")
-    here = _registered(source)
-    raise Problem(
-        f"There is no project {project_id} in the {source.place}.",
-        f"It holds: {', '.join(here)}. Name the right study: its id, or its folder."
-        if here
-        else "Name the right study, or the right data: the folder "
-        "data/ of a study, or data-try/try-… of one rehearsal, with --from.",
-    )
-
-
-def _registered(source: Source) -> list[str]:
-    """Return the ids of the projects that are registered in the source, as far as their list can be read."""
-    try:
-        return sorted(project.id for project in read_list(source.read(MASTER_LIST, _MAX_MASTER_LIST)).projects)
-    except (FileGone, TooLarge, ValueError):
-        return []
+    def with_those_in(self, folder: Path) -> Options:
+        """Add the formats that the folder has from earlier runs: another format removes none, and none goes out of
+        date. Formats whose packages are not installed are left out."""
+        here = {name for name in ("csv", "parquet") if (folder / f"answers.{name}").exists()}
+        here |= {"minari"} if (folder / "minari").is_dir() else set()
+        packages = {"parquet": "pyarrow", "minari": "minari"}
+        here -= {name for name, package in packages.items() if find_spec(package) is None}
+        return replace(self, formats=self.formats | here, long=self.long or any(folder.glob("answers-long.*")))
 
 
 def look(source: Source, project_id: str, folder: Path, options: Options) -> Tally:
     """Return what a run would do. Changes nothing. Raises `Problem`."""
-    _refuse_unknown(source, project_id, folder, find_project(source, project_id))
-    options = _with_those_here(folder, options)
-    with _checked(folder, source, project_id, options) as (state, damaged):
-        tally, known = Tally(damaged=len(damaged)), 0
-        for unit in listing.units(project_id, listing.lines(source, project_id, state)):
-            before = state.files_of(unit.user)
-            known += sum(item.listed.key in before for item in unit.items)
-            mark = listing.members(state, unit.user).mark if unit.is_session else ""
-            listing.choose(state, unit, options.wanted, tally, damaged, mark=mark)
-        tally.gone = state.file_count() - known
-        return tally
-
-
-@contextlib.contextmanager
-def _checked(
-    folder: Path, source: Source, project_id: str, options: Options
-) -> Iterator[tuple[ExportState, frozenset[str]]]:
-    """The folder's state, which cannot be changed, and the paths of damaged files."""
-    _refuse_foreign(folder)
-    try:
-        state = ExportState.read_only(folder / _STATE)
-    except sqlite3.DatabaseError:
-        raise _broken_state(folder) from None
-    try:
-        _same_study(state, folder, source, project_id, options, write=False)
-        yield state, _damaged(folder, state)
-    except sqlite3.DatabaseError:
-        raise _broken_state(folder) from None
-    finally:
-        state.close()
+    _refuse(source, project_id, folder, _find_project(source, project_id), options)
+    options = options.with_those_in(folder)
+    records = Records(folder, apart=options.apart)
+    wanted = options.wanted._replace(dry=True)
+    fetcher = Fetcher(project_id, source, records=records, folder=folder, wanted=wanted)
+    tally = fetcher.run(lambda listed, done: None)
+    tally.gone += fetcher.forget_gone()
+    return tally
 
 
 def run(source: Source, project_id: str, folder: Path, options: Options) -> dict[str, Any]:
@@ -144,268 +89,272 @@ def run(source: Source, project_id: str, folder: Path, options: Options) -> dict
     """
     mask = os.umask(0o077)
     try:
-        return _bring_up_to_date(source, project_id, folder, options)
+        project = _find_project(source, project_id)
+        _refuse(source, project_id, folder, project, options)
+        with _locked(folder):
+            return _Export(source, project_id, project, folder, options.with_those_in(folder)).run()
+    except OSError as error:
+        raise _refused(folder, error) from error
     finally:
         os.umask(mask)
 
 
-def _bring_up_to_date(source: Source, project_id: str, folder: Path, options: Options) -> dict[str, Any]:
-    project = find_project(source, project_id)
-    _refuse_foreign(folder)
-    _refuse_unknown(source, project_id, folder, project)
+@dataclass
+class _Export:
+    """A run of a folder that it has the lock of."""
+
+    source: Source
+    project_id: str
+    project: Project | None
+    folder: Path
+    options: Options
+
+    def __post_init__(self) -> None:
+        private = self.folder / PRIVATE
+        (private / "records").mkdir(exist_ok=True)
+        self._salt = private / "salt"
+        if not self._salt.exists():
+            self._salt.write_bytes(secrets.token_bytes(32))
+        if not _read_about(self.folder):
+            about = _about(self.source, self.project_id, self.options)
+            (self.folder / _ABOUT).write_text(json.dumps(about))
+        self._records = Records(self.folder, apart=self.options.apart)
+        self._answers = Answers(self.project, self.options.apart, read_fields(self.source, self.project))
+        self._counts = Counter(dict.fromkeys(_COUNTED, 0))
+        self._replaced = 0  # identities in answers
+        self._written: list[Path] = []
+
+    def run(self) -> dict[str, Any]:
+        tally = self._fetch()
+        with _bar("Writing tables") as progress:
+            self._write_tables()
+            progress(1, 1)
+        return {"folder": str(self.folder), **self._write_manifest(self._datasets()), "run": asdict(tally)}
+
+    def _fetch(self) -> Tally:
+        known = bool(self._records.names)
+        wanted = self.options.wanted
+        fetcher = Fetcher(self.project_id, self.source, records=self._records, folder=self.folder, wanted=wanted)
+        with _bar("Fetching") as progress:
+            tally = fetcher.run(progress)
+        if known and not tally.participants:
+            raise Problem(
+                f"There are no participants of {self.project_id} in the {self.source.where}, and this folder holds "
+                "theirs.",
+                "If that is right, delete the folder. If not, look at STUDY, --stack and --region.",
+            )
+        tally.gone += fetcher.forget_gone()
+        return tally
+
+    def _tables(self) -> list[Table]:
+        """All tables that are shared. The last is written as CSV alone."""
+        blocks = range(len(self.project.blocks)) if self.project else ()
+        runs = [Runs(self._answers, self.project, block) for block in blocks if self.project]
+        long = [LongAnswers(self._answers)] if self.options.long else []
+        games: list[Table] = []
+        if self.options.wanted.recordings:
+            games = [Episodes(), Callbacks(self.folder), Messages(), Calls(), Presence(self.folder)]
+        return [self._answers, *runs, Tries(), *long, *games, Problems(self.project_id, self.options.apart)]
+
+    def _write_tables(self) -> None:
+        """Read all records twice: first to find the tables' columns, then to write their rows."""
+        tables = self._tables()
+        for record in self._shown():
+            self._count(record)
+            for table in tables:
+                table.see(record)
+        tables = [table for table in tables if table.needed]
+        only_csv = Style(parquet=False, spreadsheet=self.options.spreadsheet)
+        places = [(table, self.folder, self.options.style) for table in tables[:-1]]
+        places.append((tables[-1], self.folder, only_csv))
+        if self.options.apart:
+            places.append((Identities(self._answers), self.folder / PRIVATE, only_csv))
+        self._replaced = 0
+        with contextlib.ExitStack() as stack:
+            files = [
+                (table, stack.enter_context(TableFile(place / table.name, table.columns, style)))
+                for table, place, style in places
+            ]
+            for record in self._shown():
+                for table, file in files:
+                    file.add(table.rows(record))
+        self._written = [path for _, file in files for path in file.paths if path.parent == self.folder]
+        for path in (path for name in _TABLES for path in self.folder.glob(f"{name}.*")):
+            if path not in self._written:
+                path.unlink()  # an earlier run has written it, and this one has not
+
+    def _shown(self) -> Iterator[Record]:
+        """The records; with `apart`, without identities in answers."""
+        for record in self._records:
+            self._replaced += record.without_identities() if self.options.apart else 0
+            yield record
+
+    def _count(self, record: Record) -> None:
+        counts = self._counts
+        counts["participants"] += record.is_participant
+        counts["answers"] += len(record.answers)
+        counts["finished"] += bool(record.is_participant and self._answers.finished(record))
+        for file in record.files.values():
+            counts["recordings"] += file.made is not None
+            counts["episodes"] += len(file.episodes)
+            counts["frames"] += file.frames
+            counts["foreign"] += file.kind == KeyKind.FOREIGN
+            counts["problems"] += len(file.problems)
+            if file.kind == KeyKind.SESSION:
+                counts["sessions"] += 1
+
+    def _converted(self) -> Iterator[ExportedFile]:
+        return (file.made for record in self._records for file in record.recordings() if file.made)
+
+    def _datasets(self) -> list[dict[str, Any]]:
+        """Make the Minari datasets if the options ask for them, and return their summaries. Datasets of other
+        recordings than those that are here now are removed."""
+        target, wanted = self.folder / "minari", "minari" in self.options.formats
+        if not wanted and not target.exists():
+            return []
+        last: dict[str, Any] = {"files": [], "minari": []}
+        with contextlib.suppress(Problem):
+            last = manifest.read(self.folder) or last
+        files = [file for file in last["files"] if file.path.startswith("minari/")]
+        same = {file for file in last["files"] if file.path.startswith("recordings/")} == {*self._converted()}
+        if files and same and not any(manifest.difference(self.folder, file) for file in files):
+            made: list[dict[str, Any]] = last["minari"]
+            return made
+        if not wanted:
+            shutil.rmtree(target)
+            return []
+        from hippodrome.export import datasets  # noqa: PLC0415 - imports numpy, which `--format csv` does without
+
+        with _bar("Writing Minari datasets") as progress:
+            return datasets.build(self.folder, self._records, self.project_id, progress)
+
+    def _write_manifest(self, datasets: list[dict[str, Any]]) -> dict[str, Any]:
+        """Write the manifests of the folder and of `private/`, and return that of the folder without its files."""
+        about = {
+            "project": self.project_id,
+            "projectVersion": self.project.version if self.project else None,
+            "made": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+            "source": self.source.where,
+            "identities": "apart" if self.options.apart else "together",
+            "identitiesReplacedInAnswers": self._replaced,
+            "formats": sorted(self.options.formats),
+            "counts": dict(self._counts),
+            "columns": [column.name for column in self._answers.columns],
+            "moved": [moved._asdict() for moved in self._answers.moved],
+            "minari": datasets,
+        }
+        kept = [self._salt, *([self.folder / IDENTITIES] if self.options.apart else [])]
+        raw = (file.raw for record in self._records for file in record.files.values() if file.raw)
+        private = itertools.chain((manifest.entry(self.folder, path) for path in kept), raw)
+        manifest.write(self.folder / PRIVATE / manifest.NAME, {"project": self.project_id}, private)
+        trees = (path for path in sorted((self.folder / "minari").rglob("*")) if path.is_file())
+        made_now = (manifest.entry(self.folder, path) for path in itertools.chain(self._written, trees))
+        manifest.write(self.folder / manifest.NAME, about, itertools.chain(made_now, self._converted()))
+        return about
+
+
+# The source
+
+
+def _master_list(source: Source) -> MasterList:
+    """The list of studies; an empty one if there is none. Raises ValueError and TooLarge."""
     try:
-        private = folder / PRIVATE
-        private.mkdir(parents=True, exist_ok=True)
-        private.chmod(0o700)
-    except OSError as error:
-        raise Problem(f"{folder} cannot be written: {error.strerror}.", "Name another folder.") from None
-    with _locked(folder):
-        options = _with_those_here(folder, options)
-        try:
-            state = ExportState(folder / _STATE)
-        except sqlite3.DatabaseError:
-            raise _broken_state(folder) from None
-        try:
-            return _run(source, project_id, project, folder=folder, state=state, options=options)
-        except sqlite3.DatabaseError as error:
-            raise _broken_state(folder) from error
-        except OSError as error:
-            raise _refused(folder, error) from error
-        finally:
-            state.close()
+        return read_list(source.read(MASTER_LIST, _MAX_MASTER_LIST))
+    except FileGone:
+        return MasterList([])
 
 
-def _run(
-    source: Source, project_id: str, project: Project | None, *, folder: Path, state: ExportState, options: Options
-) -> dict[str, Any]:
-    _same_study(state, folder, source, project_id, options, write=True)
-    salt = folder / PRIVATE / "salt"
-    if not salt.exists():
-        salt.write_bytes(secrets.token_bytes(32))
-    damaged = _damaged(folder, state)
-    files_before = state.file_count()
-    with _bar("Fetching") as progress:
-        tally = Fetcher(
-            project_id,
-            source=source,
-            state=state,
-            folder=folder,
-            wanted=options.wanted,
-            progress=progress,
-            damaged=damaged,
-        ).run()
-    tally.damaged = len(damaged)
-    if files_before and not tally.participants:
-        raise Problem(
-            f"There are no participants of {project_id} in the {source.where}, and this folder holds theirs.",
-            "If that is right, delete the folder. If not, look at STUDY, --stack and --region.",
-        )
-    tally.gone = fetch.forget_gone(state, folder)
-    parquet = "parquet" in options.formats
-    # If datasets are the only format, the tables are CSV.
-    style = table_files.Style("csv" in options.formats or not parquet, parquet, options.spreadsheet)
-    written: list[Path] = []
-    with _bar("Writing tables") as progress:
-        answers = StudyAnswers(state, project, options.apart, read_fields(source, project))
-        columns = answers.columns
-        written += table_files.write(folder / "answers", columns, answers.rows(), style)
-        finished, scrubbed = answers.finished, answers.scrubbed
-        written += runs.write(folder, answers, project, style)
-        if options.long:
-            written += table_files.write(folder / "answers-long", answers.LONG, answers.long_rows(), style)
-        if options.wanted.recordings:
-            written += _write_games(state, folder, style)
-        only_csv = table_files.Style(parquet=False, spreadsheet=options.spreadsheet)
-        found = tables.problems(state, project_id, options.apart)
-        written += table_files.write(folder / "problems", tables.PROBLEMS, found, only_csv)
-        private = [manifest.entry(folder, salt)]
-        if options.apart:
-            identity_columns, rows = tables.identities(state, answers.links)
-            (path,) = table_files.write(folder / PRIVATE / "identities", identity_columns, rows, only_csv)
-            path.chmod(0o600)
-            private.append(manifest.entry(folder, path))
-        progress(1, 1)
-    made = _datasets(folder, state, project_id, options)
-    _remove_stale(folder, written)
-
-    counts = state.counts() | {"finished": finished, "problems": sum(1 for _ in state.problems())}
-    about = {
-        "project": project_id,
-        "projectVersion": project.version if project else None,
-        "made": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-        "source": source.where,
-        "identities": "apart" if options.apart else "together",
-        "identitiesReplacedInAnswers": scrubbed,
-        "formats": sorted(options.formats),
-        "counts": counts,
-        "columns": [column.name for column in columns],
-        "moved": [moved._asdict() for moved in answers.moved],
-        "minari": made,
-    }
-    made_now = [*(manifest.entry(folder, path) for path in written), *_tree(folder, "minari")]
-    manifest.write(folder / PRIVATE / manifest.NAME, {"project": project_id}, [*private, *state.raw_files()])
-    manifest.write(folder / manifest.NAME, about, itertools.chain(made_now, state.converted_files()))
-    return {"folder": str(folder), **about, **{"run": asdict(tally)}}
-
-
-def _write_games(state: ExportState, folder: Path, style: table_files.Style) -> list[Path]:
-    """Write the tables of what happened and was said in games, and return their files."""
-    written: list[Path] = []
-    shared = tables.in_sessions(state)
-    written += table_files.write(folder / "episodes", *tables.episodes(state, in_sessions=shared), style)
-    if any(found.get("callbacks") for _, _, found in state.episodes()):
-        lines = tables.callbacks(state, folder, shared)
-        written += table_files.write(folder / "callbacks", tables.callback_columns(shared), lines, style)
-    if any(found.record.get("kind") == "line" for found in talk.records(state)):
-        shared_talk = state.has_sessions()
-        said = talk.messages(state, shared_talk)
-        written += table_files.write(folder / "messages", talk.columns(shared_talk), said, style)
-    if calls.has_calls(state):
-        shared_calls = state.has_sessions()
-        rows = calls.calls(state, shared_calls)
-        written += table_files.write(folder / "calls", calls.columns(shared_calls), rows, style)
-    if shared:
-        rows = tables.presence(state, folder)
-        written += table_files.write(folder / "presence", tables.PRESENCE, rows, style)
-    return written
-
-
-def _datasets(folder: Path, state: ExportState, project_id: str, options: Options) -> list[dict[str, Any]]:
-    """Make the Minari datasets if the options ask for them, and return their summaries. Datasets that no longer fit
-    the recordings are removed."""
-    now, before = f"{_DATASETS} {state.recordings_fingerprint()}", state.fact("minari")
-    if "minari" not in options.formats and before != now:
-        shutil.rmtree(folder / "minari", ignore_errors=True)
-        state.set_fact("minari", "")
-    if "minari" not in options.formats or (before == now and _sound_minari(folder)):
-        made: list[dict[str, Any]] = msgspec.json.decode(state.fact("datasets") or "[]")
-        return made if state.fact("minari") == now else []
-    from hippodrome.export import datasets  # noqa: PLC0415 - imports numpy, which `--format csv` does without
-
-    state.set_fact("minari", "")
-    with _bar("Writing Minari datasets") as progress:
-        made = datasets.build(folder, state, project_id, progress)
-    state.set_fact("datasets", msgspec.json.encode(made).decode())
-    state.set_fact("minari", now)
-    return made
-
-
-def _sound_minari(folder: Path) -> bool:
-    """Whether the datasets' files are as the last manifest lists them."""
+def _find_project(source: Source, project_id: str) -> Project | None:
+    """The registered study, which has the order of its steps; None if it cannot be read, or is not there."""
     try:
-        last = manifest.read(folder)
-    except Problem:
-        return False
-    files = [file for file in last["files"] if file.path.startswith("minari/")] if last else []
-    return bool(files) and not any(manifest.damaged(folder, files))
+        listed = _master_list(source)
+    except (TooLarge, ValueError):
+        screen.warning(f"{MASTER_LIST} cannot be read: steps stand in the order of their names.")
+        return None
+    project = listed.find(project_id)
+    if project is None and any(entry.id in (None, project_id) for entry in listed.unreadable):
+        screen.warning(f"An entry of {MASTER_LIST} cannot be read, maybe this project's: steps stand by their names.")
+    return project
 
 
-def _remove_stale(folder: Path, written: list[Path]) -> None:
-    """Remove the tables of an earlier run that this run did not write, and half-written tables."""
-    games = ("episodes", "callbacks", "messages", "calls", "presence")
-    for name in ("answers", "answers-long", "runs", "runs-*", "tries", *games, "problems"):
-        for path in folder.glob(f"{name}.*"):
-            if path not in written:
-                path.unlink()
-
-
-def _tree(folder: Path, name: str) -> Iterator[ExportedFile]:
-    """All files below a folder in the export folder."""
-    for path in sorted((folder / name).rglob("*")):
-        if path.is_file():
-            yield manifest.entry(folder, path)
-
-
-def check(folder: Path) -> list[str]:
-    """Return a sentence for each file that differs from the folder's manifest. Reads no source, and changes nothing.
-    Raises `Problem` without a manifest, or if it is damaged."""
-    about = manifest.read(folder)
-    if about is None:
-        raise Problem(f"There is no {manifest.NAME} in {folder}.", "Name the folder that `data` has filled.")
-    wrong = [f"{path} {difference}" for path, difference in manifest.damaged(folder, about["files"])]
-    wrong += [f"{path} is not in the manifest" for path in manifest.unlisted(folder, about["files"])]
-    private = manifest.read(folder / PRIVATE)
-    if private is not None:
-        wrong += [f"{path} {difference}" for path, difference in manifest.damaged(folder, private["files"])]
-    return wrong
-
-
-# The folder
-
-
-def _refuse_foreign(folder: Path) -> None:
-    """Raise `Problem` for a folder with other files, which is not an export folder."""
+def _refuse(source: Source, project_id: str, folder: Path, project: Project | None, options: Options) -> None:
+    """Raise `Problem` for a folder that holds something else, or for a source without participants of this project."""
     if folder.exists() and not folder.is_dir():
         raise Problem(f"{folder} is a file.", "Name a folder, or none.")
     ours = (folder / manifest.NAME).exists() or (folder / PRIVATE).is_dir()
     if folder.is_dir() and not ours and any(folder.iterdir()):
         raise Problem(f"{folder} has other files already.", "Name an empty folder, or one that does not exist yet.")
+    _refuse_other(source, project_id, folder, options)
+    if not _read_about(folder) and not any(True for _ in source.list(keys.prefix(project_id))):
+        if project:
+            raise Problem(f"No participant has begun {project_id} yet.", f"Answers will be in the {source.where}.")
+        with contextlib.suppress(TooLarge, ValueError):
+            if here := sorted(project.id for project in _master_list(source).projects):
+                raise Problem(
+                    f"There is no project {project_id} in the {source.place}.",
+                    f"It holds: {', '.join(here)}. Name the right study: its id, or its folder.",
+                )
+        raise Problem(
+            f"There is no project {project_id} in the {source.place}.",
+            "Name the right study, or the right data: the folder data/ of a study, or data-try/try-… of one rehearsal, "
+            "with --from.",
+        )
 
 
-def _same_study(
-    state: ExportState, folder: Path, source: Source, project_id: str, options: Options, *, write: bool
-) -> None:
-    """Raise `Problem` if an earlier run of this folder had another study, source or mode of identities. With `write`,
-    save them."""
+def _about(source: Source, project_id: str, options: Options) -> dict[str, str]:
     mode = "apart" if options.apart else "together"
-    fixed = {"project": project_id, "identities": mode, "source": source.where, "place": source.place}
+    return {"project": project_id, "identities": mode, "source": source.where, "place": source.place}
+
+
+def _read_about(folder: Path) -> dict[str, str]:
+    """What the earlier runs of the folder had in common; {} if there were none."""
+    try:
+        about: dict[str, str] = json.loads((folder / _ABOUT).read_text())
+    except (FileNotFoundError, ValueError):
+        return {}
+    return about
+
+
+def _refuse_other(source: Source, project_id: str, folder: Path, options: Options) -> None:
+    """Raise `Problem` if an earlier run of this folder had another study, source or mode of identities, or if nobody
+    knows any more whose its numbers are."""
     words = {
         "project": "holds the data of the project {}",
         "identities": "was made with identities {}",
         "source": "was filled from the {}",
         "place": "was filled from the {}",
     }
-    is_new = state.fact("project") is None
-    for name, value in fixed.items():
-        before = state.fact(name)
-        if before is not None and before != value:
-            other = f"{before} of this machine" if before == "folder" else before
+    before = _read_about(folder)
+    for name, value in _about(source, project_id, options).items():
+        if (other := before.get(name, value)) != value:
+            other = f"{other} of this machine" if other == "folder" else other
             raise Problem(
                 f"{folder} {words[name].format(other)}.",
                 f"Name another folder, such as --to {folder}-2, or rename this one.",
             )
-        if before is None and write:
-            state.set_fact(name, value)
-    if is_new and options.apart:
-        _restore_numbers(state, folder, write)
+    if options.apart and (folder / manifest.NAME).exists() and not (folder / IDENTITIES).exists():
+        raise Problem(
+            f"{folder} holds data with numbers in place of ids, but {IDENTITIES} is missing there.",
+            "Put the file back, or name another folder. In another folder people get other numbers.",
+        )
 
 
-def _restore_numbers(state: ExportState, folder: Path, write: bool) -> None:
-    """Read the participants' numbers from identities.csv, in case the state was deleted. Raises `Problem` if the folder
-    has data and this file is missing."""
-    path = folder / PRIVATE / "identities.csv"
-    if not path.exists():
-        if (folder / manifest.NAME).exists():
-            raise Problem(
-                f"{folder} holds data with numbers in place of ids, but {path.relative_to(folder)} is missing there.",
-                "Put the file back, or name another folder. In another folder people get other numbers.",
-            )
-        return
-    if not write:
-        return
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        for row in csv.DictReader(file):
-            user, number = (row.get("userId") or "").removeprefix("'"), row.get("participant") or ""
-            if user and number:
-                state.find_or_add(user, True, number)
-
-
-def _damaged(folder: Path, state: ExportState) -> frozenset[str]:
-    """The exported files that have changed or are missing. The run fetches their sources again."""
-    if not state.file_count():
-        return frozenset()
-    with _bar("Checking what is here"):
-        files = itertools.chain(state.converted_files(), state.raw_files())
-        return frozenset(path for path, _ in manifest.damaged(folder, files))
+# The folder
 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, which the system releases when the process ends. Raises `Problem` if another run has
-    it."""
+    """Hold the folder's lock, which the system releases when the process ends. Makes the folder. Raises `Problem` if
+    that is not possible, or if another run has the lock."""
     import fcntl  # noqa: PLC0415 - not on every system
 
-    with (folder / PRIVATE / "lock").open("w") as file:
+    private = folder / PRIVATE
+    try:
+        private.mkdir(parents=True, exist_ok=True)
+        private.chmod(0o700)
+    except OSError as error:
+        raise Problem(f"{folder} cannot be written: {error.strerror}.", "Name another folder.") from None
+    with (private / "lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -413,13 +362,6 @@ def _locked(folder: Path) -> Iterator[None]:
                 f"Another run is filling {folder}.", "Wait until it is done, or name another folder."
             ) from None
         yield
-
-
-def _broken_state(folder: Path) -> Problem:
-    return Problem(
-        f"{folder / _STATE} is damaged.",
-        "Delete that one file and run the command again: everything is fetched anew, and numbers stay as they are.",
-    )
 
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

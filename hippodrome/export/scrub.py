@@ -9,9 +9,10 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from hippodrome.export.state import ExportedParticipant
+if TYPE_CHECKING:
+    from hippodrome.export.records import Record
 
 SHORTEST = 6  # characters; a shorter identity would be found in too many texts by chance
 OWN_FIELDS = frozenset(
@@ -124,7 +125,7 @@ class Scrub:
         return self._replacements.get(found[0]) or self._replacements.get(found[0].lower(), "(id)")
 
 
-def identities(participant: ExportedParticipant) -> dict[str, str]:
+def identities(participant: Record) -> dict[str, str]:
     """Return the texts that identify a participant, each with its replacement: the id, the values of the link, and the
     completion codes."""
     found = {value: f"({name})" for name, value in texts(participant.document.get("link")).items()}
@@ -132,12 +133,12 @@ def identities(participant: ExportedParticipant) -> dict[str, str]:
     return {**found, participant.user: participant.number}
 
 
-def completion_code(participant: ExportedParticipant) -> str | None:
+def completion_code(participant: Record) -> str | None:
     """Return the completion code that the participant was shown."""
     return next((clean(code) for code in _codes(participant)), None)
 
 
-def _codes(participant: ExportedParticipant) -> list[str]:
+def _codes(participant: Record) -> list[str]:
     """The codes of a participant, first the one that they were shown: that of a game that failed comes before that of
     an unmatched participant, in `session.json`, and this before that in `participant.json`."""
     documents = (document.get("completionCode") for document in (participant.membership, participant.document))

@@ -6,16 +6,18 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import json
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from types import TracebackType
 from typing import Any, NamedTuple
 
+from hippodrome.export.records import Record
 from hippodrome.export.scrub import clean
+from hippodrome.export.values import json_text
 from hippodrome.protocol.times import time_text
 
 BATCH = 1_000  # rows
@@ -25,7 +27,7 @@ _PLAIN_NUMBER = re.compile(r"[+-]?[0-9]+(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?")
 
 
 class Column(NamedTuple):
-    """A column: its name, and its Arrow type by name (`types`)."""
+    """A column: its name, and its Arrow type by name (`_types`)."""
 
     name: str
     type: str = "text"
@@ -41,8 +43,8 @@ class Style:
     spreadsheet: bool = False
 
 
-def types() -> dict[str, Any]:
-    """Return the Arrow types of columns, by the names of types in `Column`."""
+def _types() -> dict[str, Any]:
+    """The Arrow types of columns, by the names of types in `Column`."""
     import pyarrow as pa
 
     return {
@@ -55,55 +57,86 @@ def types() -> dict[str, Any]:
     }
 
 
-def write(base: Path, columns: Sequence[Column], rows: Iterable[Sequence[Any]], style: Style) -> list[Path]:
-    """Write `base`.csv and `base`.parquet, each whole or not at all, and return their paths.
+class Table:
+    """A table. It sees all records before it is asked for its columns, and then for the rows of one after the other."""
 
-    Values must have the types of their columns (`fit`); None is an empty cell.
-    """
-    paths = []
-    with contextlib.ExitStack() as stack:
-        sheet = parquet = None
+    name: str
+    needed = True  # whether the table is written
+
+    @property
+    def columns(self) -> Sequence[Column]:
+        """The columns, once all records were seen."""
+        raise NotImplementedError
+
+    def see(self, record: Record) -> None:
+        """Look at what the columns depend on."""
+
+    def rows(self, record: Record) -> Iterator[Sequence[Any]]:
+        """Yield the rows of a participant or session."""
+        raise NotImplementedError
+
+
+class TableFile:
+    """`base`.csv and `base`.parquet while they are written. Each appears whole, or not at all after an error."""
+
+    def __init__(self, base: Path, columns: Sequence[Column], style: Style) -> None:
+        self.paths: list[Path] = []
+        self._columns, self._style = columns, style
+        self._rows: list[Sequence[Any]] = []
+        self._files = contextlib.ExitStack()
+        self._sheet = self._parquet = None
         if style.csv:
-            paths.append(base.with_name(f"{base.name}.csv"))
-            file = stack.enter_context(_part(paths[-1]).open("w", encoding="utf-8", newline=""))
+            file = self._files.enter_context(self._part(base, "csv").open("w", encoding="utf-8", newline=""))
             if style.spreadsheet:
                 file.write("\ufeff")  # without this mark Excel takes another encoding than UTF-8
-            sheet = csv.writer(file)
-            sheet.writerow([_cell(column.name, style.spreadsheet) for column in columns])
+            self._sheet = csv.writer(file)
+            self._sheet.writerow([_cell(column.name, style.spreadsheet) for column in columns])
         if style.parquet:
             import pyarrow as pa
             import pyarrow.parquet as pq
 
-            paths.append(base.with_name(f"{base.name}.parquet"))
-            schema = pa.schema([(column.name, types()[column.type]) for column in columns])
-            parquet = stack.enter_context(pq.ParquetWriter(_part(paths[-1]), schema, compression="zstd"))
-        for batch in _batches(rows):
-            if sheet:
-                sheet.writerows([_cell(value, style.spreadsheet) for value in row] for row in batch)
-            if parquet:
-                arrays = [
-                    pa.array([_typed(row[place], column.type) for row in batch], types()[column.type])
-                    for place, column in enumerate(columns)
-                ]
-                parquet.write_table(pa.table(arrays, schema=schema))
-    for path in paths:
-        os.replace(_part(path), path)
-    return paths
+            types = _types()
+            self._schema = pa.schema([(column.name, types[column.type]) for column in columns])
+            part = self._part(base, "parquet")
+            self._parquet = self._files.enter_context(pq.ParquetWriter(part, self._schema, compression="zstd"))
+
+    def _part(self, base: Path, suffix: str) -> Path:
+        self.paths.append(base.with_name(f"{base.name}.{suffix}"))
+        return _part(self.paths[-1])
+
+    def add(self, rows: Iterable[Sequence[Any]]) -> None:
+        """Add rows, whose values have the types of their columns (`fit`); None is an empty cell."""
+        for row in rows:
+            self._rows.append(row)
+            if len(self._rows) >= BATCH:
+                self._write()
+
+    def _write(self) -> None:
+        if self._sheet:
+            self._sheet.writerows([_cell(value, self._style.spreadsheet) for value in row] for row in self._rows)
+        if self._parquet:
+            import pyarrow as pa
+
+            arrays = [
+                pa.array([_typed(row[place], column.type) for row in self._rows], self._schema.types[place])
+                for place, column in enumerate(self._columns)
+            ]
+            self._parquet.write_table(pa.table(arrays, schema=self._schema))
+        self._rows = []
+
+    def __enter__(self) -> TableFile:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        with self._files:
+            if self._rows and kind is None:
+                self._write()
+        for path in self.paths if kind is None else ():
+            os.replace(_part(path), path)
 
 
 def _part(path: Path) -> Path:
     return path.with_name(f"{path.name}.part")
-
-
-def _batches(rows: Iterable[Sequence[Any]]) -> Iterator[list[Sequence[Any]]]:
-    batch: list[Sequence[Any]] = []
-    for row in rows:
-        batch.append(row)
-        if len(batch) >= BATCH:
-            yield batch
-            batch = []
-    if batch:
-        yield batch
 
 
 def _cell(value: Any, spreadsheet: bool) -> str:
@@ -137,10 +170,5 @@ def fit(value: Any, kind: str) -> Any:
     if kind == "texts":
         return [clean(item) for item in (value if isinstance(value, list) else [value])]
     if kind == "text":
-        return clean(value if isinstance(value, str) else json_text(value))
+        return clean(value) if isinstance(value, str) else json_text(value)
     return float(value) if kind == "number" and not isinstance(value, str) else value
-
-
-def json_text(value: Any) -> str:
-    """Return a value as compact JSON, with all characters unescaped."""
-    return json.dumps(value, separators=(",", ":"), ensure_ascii=False)

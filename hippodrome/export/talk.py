@@ -1,117 +1,120 @@
-"""Makes the table of messages, of the tapes of games in which people talk (`trial/recordings/tape.py`)."""
+"""The tables `messages` and `calls`, of the tapes of games in which people talk (`trial/recordings/tape.py`)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import Any
 
-from hippodrome.export.recording_columns import as_whole, when
+from hippodrome.export.keys import KeyKind
+from hippodrome.export.records import Record
 from hippodrome.export.scrub import Scrub, clean
-from hippodrome.export.state import ExportedParticipant, ExportState
-from hippodrome.export.table_files import Column
+from hippodrome.export.table_files import Column, Table
+from hippodrome.export.values import as_text, as_whole, when
 
 SCHEMA = 1
 _Said = tuple[Mapping[str, Any], datetime]
-
-MESSAGES = (
-    Column("participant"),
-    Column("studyStep"),
-    Column("attempt", "whole"),
-    Column("episode", "whole"),
-    Column("step", "whole"),
-    Column("n", "whole"),
-    Column("by"),
-    Column("to"),
-    Column("time", "time"),
-    Column("text"),
-    Column("replySeconds", "number"),
-    Column("typedSeconds", "number"),
-    Column("held"),
-    Column("original"),
-)
-
-
-class TapeRecord(NamedTuple):
-    """A record of a tape, and where it is from."""
-
-    participant: ExportedParticipant | None
-    """The participant; None in a session."""
-    session: str | None
-    people: Mapping[str, str]
-    """In a session: the members' numbers by player."""
-    step: str
-    attempt: int | None
-    record: Mapping[str, Any]
+_WHERE = (Column("participant"), Column("studyStep"), Column("attempt", "whole"))
+_WHEN = (Column("episode", "whole"), Column("step", "whole"), Column("n", "whole"))
 
 
 def document(
     piece: Mapping[str, Any], where: Mapping[str, Any], people: Mapping[int, str], hide: Scrub
 ) -> dict[str, Any]:
-    """Return what the state keeps of a piece of a tape, without identities: `where` (step, attempt, session), the
-    `people` by player instead of by seat, and the records. Raises ValueError if the piece cannot be read."""
+    """Return what tables need of a piece of a tape, without identities: `where` (step, attempt, session), the `people`
+    by player instead of by seat, and the lines and calls. Raises ValueError if the piece cannot be read."""
     records, seats = piece.get("records"), piece.get("seats", [])
     if piece.get("schema") != SCHEMA or not isinstance(records, list) or not isinstance(seats, list):
         raise ValueError("it is no piece of a tape that this version can read")
     playing = {str(player): people[seat] for seat, player in enumerate(seats) if seat in people}
     hide = hide.sparing(list(map(str, seats)))
-    kept = [hide.record(record) for record in records if isinstance(record, Mapping)]
-    return {**where, "people": playing, "records": kept}
+    kept = [_needed(hide.record(record)) for record in records if isinstance(record, Mapping)]
+    return {**where, "people": playing, "records": [record for record in kept if record]}
 
 
-def records(state: ExportState) -> Iterator[TapeRecord]:
-    """Yield the records of all tapes: those of a participant or a session in the order in which they were made."""
-    for participant, piece in state.tapes():
-        people = piece.get("people", {})
-        for record in piece["records"]:
-            yield TapeRecord(participant, piece["session"], people, piece["step"], piece["attempt"], record)
+def _needed(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A line, or a call without request and answer, which may be long; {} of another record."""
+    if record.get("kind") != "call":
+        return record if record.get("kind") == "line" else {}
+    answer = record.get("answer")
+    error = answer.get("error") if isinstance(answer, Mapping) else None
+    code = error.get("code") if isinstance(error, Mapping) else None
+    return {name: value for name, value in record.items() if name not in ("request", "answer")} | {"error": code}
 
 
-def columns(in_sessions: bool) -> list[Column]:
-    """Return the columns of `messages`."""
-    return [*MESSAGES, *((Column("session"),) if in_sessions else ())]
+class _TapeTable(Table):
+    """A table with rows of tapes' records of one kind. In a study with sessions it has a column for them."""
+
+    kind: str
+    own: Sequence[Column]
+
+    def __init__(self) -> None:
+        self.needed = self._in_sessions = False
+
+    def see(self, record: Record) -> None:
+        kinds = {file.kind for file in record.files.values()}
+        self._in_sessions = self._in_sessions or bool(kinds & {KeyKind.SESSION, KeyKind.MEMBERSHIP})
+        self.needed = self.needed or any(self._of(piece) for piece in record.tapes())
+
+    def _of(self, piece: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+        return [record for record in piece["records"] if record["kind"] == self.kind]
+
+    @property
+    def columns(self) -> list[Column]:
+        return [*_WHERE, *_WHEN, *self.own, *((Column("session"),) if self._in_sessions else ())]
+
+    def _row(self, piece: Mapping[str, Any], number: str | None, *values: Any) -> list[Any]:
+        session = (piece["session"],) if self._in_sessions else ()
+        return [number, piece["step"], piece["attempt"], *values, *session]
 
 
-def messages(state: ExportState, in_sessions: bool) -> Iterator[list[Any]]:
-    """Yield a row for each line that was said, or that the agent's `moderate` has held back.
+class Messages(_TapeTable):
+    """A row for each line that was said, or that the agent's `moderate` has held back.
 
-    `participant` is who has said it, None if it was the agent. `replySeconds` is the
-    time since the line that it answers: for a line of the agent's `reply`, the line that it was asked; else the last
-    line of somebody else that its speaker has read, if that is newer than their own last line.
+    `participant` is who has said it, None if it was the agent. `replySeconds` is the time since the line that it
+    answers: for a line of the agent's `reply`, the line that it was asked; else the last line of somebody else that its
+    speaker has read, if that is newer than their own last line.
     """
-    game: object = None
-    before: list[_Said] = []
-    for found in records(state):
-        owner = found.participant.user if found.participant else found.session
-        if (owner, found.step) != game:
-            game, before = (owner, found.step), []
-        line = found.record
-        if line.get("kind") != "line":
-            continue
-        by, time, typed = str(line.get("by", "")), when(line.get("time")), as_whole(line.get("typed"))
-        to = line.get("to")
-        held = line.get("held") is True
-        number = found.participant.number if found.participant and "id" in line else found.people.get(by)
-        answered = None if held or time is None else _answered(line, by, before)
-        yield [
-            number,
-            found.step,
-            found.attempt,
-            as_whole(line.get("episode")),
-            as_whole(line.get("step")),
-            as_whole(line.get("n")),
-            clean(by),
-            " ".join(clean(str(name)) for name in to) if isinstance(to, list) else None,
-            time,
-            _text(line.get("text")),
-            None if answered is None or time is None else round((time - answered).total_seconds(), 3),
-            None if typed is None else typed / 1000,
-            "true" if held else None,
-            _text(line.get("original")),
-            *([found.session] if in_sessions else ()),
-        ]
-        if time is not None and not held:
-            before.append((line, time))
+
+    name = "messages"
+    kind = "line"
+    own = (
+        Column("by"),
+        Column("to"),
+        Column("time", "time"),
+        Column("text"),
+        Column("replySeconds", "number"),
+        Column("typedSeconds", "number"),
+        Column("held"),
+        Column("original"),
+    )
+
+    def rows(self, record: Record) -> Iterator[list[Any]]:
+        step = ""
+        before: list[_Said] = []
+        for piece in record.tapes():
+            if piece["step"] != step:
+                step, before = piece["step"], []
+            for line in self._of(piece):
+                by, time, typed = str(line.get("by", "")), when(line.get("time")), as_whole(line.get("typed"))
+                to, held = line.get("to"), line.get("held") is True
+                own = record.is_participant and "id" in line
+                answered = None if held or time is None else _answered(line, by, before)
+                yield self._row(
+                    piece,
+                    record.number if own else piece["people"].get(by),
+                    *(as_whole(line.get(name)) for name in ("episode", "step", "n")),
+                    clean(by),
+                    " ".join(clean(str(name)) for name in to) if isinstance(to, list) else None,
+                    time,
+                    as_text(line.get("text")),
+                    None if answered is None or time is None else round((time - answered).total_seconds(), 3),
+                    None if typed is None else typed / 1000,
+                    "true" if held else None,
+                    as_text(line.get("original")),
+                )
+                if time is not None and not held:
+                    before.append((line, time))
 
 
 def _answered(line: Mapping[str, Any], by: str, before: Sequence[_Said]) -> datetime | None:
@@ -126,5 +129,41 @@ def _answered(line: Mapping[str, Any], by: str, before: Sequence[_Said]) -> date
     return None
 
 
-def _text(value: Any) -> str | None:
-    return clean(value) if isinstance(value, str) else None
+class Calls(_TapeTable):
+    """A row for each call of a language model. `n` is the number of the line that was being answered."""
+
+    name = "calls"
+    kind = "call"
+    own = (
+        Column("time", "time"),
+        Column("milliseconds", "whole"),
+        Column("path"),
+        Column("model"),
+        Column("status", "whole"),
+        Column("error"),
+        Column("inputTokens", "whole"),
+        Column("outputTokens", "whole"),
+        Column("estimated"),
+        Column("hash"),
+    )
+
+    def rows(self, record: Record) -> Iterator[list[Any]]:
+        for piece in record.tapes():
+            for call in self._of(piece):
+                tokens = call.get("tokens")
+                tokens = tokens if isinstance(tokens, Mapping) else {}
+                yield self._row(
+                    piece,
+                    record.number or None,
+                    *(as_whole(call.get(name)) for name in ("episode", "step", "line")),
+                    when(call.get("time")),
+                    as_whole(call.get("ms")),
+                    as_text(call.get("path")),
+                    as_text(call.get("model")),
+                    as_whole(call.get("status")),
+                    as_text(call["error"]),
+                    as_whole(tokens.get("input")),
+                    as_whole(tokens.get("output")),
+                    "true" if tokens.get("estimated") is True else None,
+                    as_text(call.get("hash")),
+                )

@@ -17,7 +17,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from hippodrome.export import recording_columns, recording_lines
+from hippodrome.export import recording
 from hippodrome.export.scrub import SHORTEST, Scrub
 
 ABOUT_ONE = frozenset({"on_feedback", "on_form", "on_join", "on_leave", "on_return"})
@@ -43,8 +43,8 @@ def rewrite(source: Path, target: Path, seat: int, user: str) -> bool:
     erased: _Erased | None = None
     differs = False
     with target.open("wb") as file:
-        for text in recording_lines.texts(source, problems):
-            line = recording_lines.parsed(text)
+        for text in recording.texts(source, problems):
+            line = recording.parsed(text)
             erased = erased or _Erased(line or {}, seat, user)
             left = erased.without(line, text) if line is not None else None
             same = left == line and line is not None
@@ -60,12 +60,12 @@ class _Erased:
     """Removes a member's data from the lines of a recording, of which `header` is the first."""
 
     def __init__(self, header: Mapping[str, Any], seat: int, user: str) -> None:
-        humans = recording_columns.humans_of(header)
+        humans = recording.humans_of(header)
         self._first = humans[0] if humans else ""
-        players = {name for name, of in recording_columns.seats_of(header).items() if of == seat}
+        players = {name for name, of in recording.seats_of(header).items() if of == seat}
         self._players: Collection[str] | None = players if header.get("kind") == "header" else None  # None: unknown
         self._id = user.lower().encode() if len(user) >= SHORTEST else None
-        self._hide = Scrub({user: ""}).sparing(recording_columns.players_of(header))
+        self._hide = Scrub({user: ""}).sparing(recording.players_of(header))
 
     def without(self, line: Mapping[str, Any], text: bytes) -> dict[str, Any] | None:
         """Return the line without the member's data; None if it is only about them. `text` is the line as written."""

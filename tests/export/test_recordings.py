@@ -6,6 +6,7 @@ import gzip
 import itertools
 import json
 import re
+import shutil
 import subprocess
 import sys
 import zlib
@@ -22,7 +23,6 @@ from hypothesis import strategies as st
 from hippodrome.cli import main
 from hippodrome.console.problem import Exit
 from hippodrome.export import recording as converted
-from hippodrome.export import recording_columns
 from hippodrome.export.scrub import Scrub
 from hippodrome.trial.recordings import recording
 from testing.exploration import examples
@@ -111,7 +111,7 @@ JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
     max_leaves=5,
 )
-NAMES = st.sampled_from([*recording_columns.schema().names, "kind", "v", "x"])
+NAMES = st.sampled_from([*converted.schema().names, "kind", "v", "x"])
 
 
 @settings(max_examples=examples(80))
@@ -176,7 +176,7 @@ def test_bombs_and_false_sizes_of_observations_are_refused(tmp_path: Path) -> No
 
 
 def test_long_recordings_are_written_in_groups(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(recording_columns, "GROUP_ROWS", 100)
+    monkeypatch.setattr(converted, "GROUP_ROWS", 100)
     body = record(tmp_path, "ann", frames=950)
     done, found = convert(tmp_path, body)
     assert pq.read_metadata(tmp_path / "out.parquet").num_row_groups == 10
@@ -531,12 +531,12 @@ def test_participants_numbers_are_random_and_stay_the_same_in_later_runs(tmp_pat
         user: number for user, number in numbers(data(tmp_path, "--identities", "apart")).items() if user in users
     } == first
     listed = (out / "manifest.json").read_bytes()
-    (out / "private/state.sqlite").unlink()  # identities.csv alone keeps them
+    shutil.rmtree(out / "private/records")  # identities.csv alone keeps them
     assert numbers(data(tmp_path, "--identities", "apart", "--spreadsheet"))["user-0003"] == first["user-0003"]
-    (out / "private/state.sqlite").unlink()
+    shutil.rmtree(out / "private/records")
     assert numbers(data(tmp_path, "--identities", "apart"))["user-0003"] == first["user-0003"]
     assert json.loads((out / "manifest.json").read_bytes())["files"] == json.loads(listed)["files"]
-    (out / "private/state.sqlite").unlink()
+    shutil.rmtree(out / "private/records")
     (out / "private/identities.csv").unlink()
     assert main(["data", "maze", "--to", str(out), "--from", str(tmp_path / "data"), "--identities", "apart"]) == Exit.FAILED  # fmt: skip
     again = numbers(data(tmp_path, "--identities", "apart", out="elsewhere"))

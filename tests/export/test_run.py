@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import shutil
+import signal
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,12 @@ from hippodrome.control.model.project import MASTER_LIST, MasterList
 from hippodrome.control.model.records import to_json
 from hippodrome.export import fetch, manifest
 from hippodrome.export import run as export_run
-from hippodrome.export.fetch import Fetcher
+from hippodrome.export.fetch import Fetcher, interruption
 from hippodrome.export.page_fields import fields_of
+from hippodrome.export.records import Records
 from hippodrome.export.source import FileGone, Folder
+from hippodrome.export.table_files import TableFile
+from hippodrome.export.tables import Episodes
 from hippodrome.protocol.handover import Handover
 from hippodrome.protocol.keys import handover_key
 from testing.studies import study
@@ -336,12 +340,16 @@ def test_a_dry_run_says_what_there_is_to_do_and_makes_nothing(place: Place) -> N
     assert not place.out.exists()
     place.done()
     assert place.run("--dry-run").code == Exit.DONE
-    state = (place.out / "private/state.sqlite").read_bytes()
+    before = everything(place.out / "private")
     (place.out / "recordings/user-0000/1/3-episode-0001.parquet").unlink()
     shutil.rmtree(place.data / key("user-0001", ""))
     dry = place.run("--dry-run", "--json")
     assert (dry.json["damaged"], dry.json["changed"], dry.json["gone"]) == (1, 1, 6)
-    assert (place.out / "private/state.sqlite").read_bytes() == state
+    assert everything(place.out / "private") == before
+
+
+def everything(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_participants_erased_at_the_source_are_erased_in_the_folder(place: Place) -> None:
@@ -398,7 +406,7 @@ def test_a_damaged_file_is_found_by_its_hash_and_made_again(place: Place, how: s
     assert place.listed() == before
 
 
-def test_a_damaged_manifest_or_state_is_reported(place: Place) -> None:
+def test_a_damaged_manifest_is_reported_and_written_again(place: Place) -> None:
     crowd(place.put, place.tmp, 2)
     place.done()
     for name in ("manifest.json", "private/manifest.json"):
@@ -406,13 +414,20 @@ def test_a_damaged_manifest_or_state_is_reported(place: Place) -> None:
         checked = place.run("--check")
         assert (checked.code, f"{name} is damaged" in checked.err) == (Exit.FAILED, True)
         place.done()
-    (place.out / "private/state.sqlite").write_bytes(b"no database at all" * 100)
-    for more in ([], ["--dry-run"]):
-        ran = place.run(*more)
-        assert (ran.code, "state.sqlite is damaged" in ran.err) == (Exit.FAILED, True)
-    (place.out / "private/state.sqlite").unlink()
-    place.done()
     assert place.run("--check", out=place.tmp / "nowhere").code == Exit.FAILED
+
+
+@pytest.mark.parametrize("damage", [b"", b'{"files": 5}', b'{"user": "user-0001", "number": "", "files": [{}]}', None])
+def test_a_participant_whose_record_is_damaged_or_gone_is_fetched_again(place: Place, damage: bytes | None) -> None:
+    crowd(place.put, place.tmp, 3)
+    place.done()
+    before, kept = place.listed(), place.out / "private/records/user-0001.json"
+    if damage is None:
+        kept.unlink()
+    else:
+        kept.write_bytes(damage)
+    assert place.done()["run"]["new"] == 6
+    assert place.listed() == before
 
 
 # Cut off
@@ -452,11 +467,25 @@ def test_a_run_interrupted_while_fetching_is_continued(place: Place, monkeypatch
     }
 
 
+def test_ctrl_c_ends_a_run_where_it_can_be_ended_and_at_once_if_pressed_again() -> None:
+    def pressed_at_the_end() -> None:
+        with interruption() as check:
+            check()
+            signal.raise_signal(signal.SIGINT)
+            for end in (check, lambda: signal.raise_signal(signal.SIGINT)):
+                with pytest.raises(KeyboardInterrupt):
+                    end()
+
+    with pytest.raises(KeyboardInterrupt):
+        pressed_at_the_end()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_a_file_that_was_not_noted_before_a_kill_is_made_again(place: Place) -> None:
     """The file exists, but the state does not name it, so it is made again."""
     crowd(place.put, place.tmp, 3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Fetcher, "_save", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(Records, "save", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         assert place.run().code == Exit.INTERRUPTED
     left = place.out / "private" / "incoming" / "half.part"
     left.write_bytes(b"half a file")
@@ -464,23 +493,20 @@ def test_a_file_that_was_not_noted_before_a_kill_is_made_again(place: Place) -> 
     assert not left.exists()
 
 
-@pytest.mark.parametrize("what", ["answers", "episodes", "write"])
-def test_tables_are_whole_after_an_interruption(place: Place, monkeypatch: Any, what: str) -> None:
+@pytest.mark.parametrize("what", [(TableFile, "_write"), (Episodes, "rows"), (manifest, "write")])
+def test_tables_are_whole_after_an_interruption(place: Place, what: tuple[Any, str]) -> None:
     users = crowd(place.put, place.tmp, 3)
     place.done()
     before = {name: (place.out / name).read_bytes() for name in ("answers.csv", "answers.parquet", "manifest.json")}
     arrive(place.put, users[2], {"3": GAME})
     with pytest.MonkeyPatch.context() as patch:
-        from hippodrome.export import table_files, tables
 
         def stop(*args: Any, **named: Any) -> Any:
             raise KeyboardInterrupt
 
-        patch.setattr(manifest if what == "write" else tables, what, stop) if what != "answers" else patch.setattr(
-            table_files, "_batches", stop
-        )
+        patch.setattr(*what, stop)
         assert place.run().code == Exit.INTERRUPTED
-    if what == "answers":  # a table is replaced whole or not at all
+    if what[0] is not manifest:  # a table is replaced whole or not at all
         assert {name: (place.out / name).read_bytes() for name in before} == before
     place.done()
     assert place.rows()[2]["3.score"] == "12.5"
@@ -586,11 +612,16 @@ def test_a_file_deleted_while_it_is_fetched_is_skipped(place: Place, monkeypatch
 
 
 def test_folders_of_participants_are_distinct_on_every_machine(place: Place) -> None:
-    from hippodrome.export.state import ExportState
-
-    state = ExportState(None)
-    folders = [state.find_or_add(user, False).folder for user in ("Ann", "ann", "ANN", "x")]
-    assert len({name.lower() for name in folders}) == len(folders)
+    users = ["Ann", "ann", "ANN", "x"]
+    for user in users:
+        place.put(recording_key(user), record(place.tmp, user))
+    place.done()
+    before = {row["participant"]: row["file"] for row in place.rows("episodes")}
+    assert before.keys() == set(users)
+    assert len({path.lower() for path in before.values()}) == len(users)
+    arrive(place.put, "AnN", {})  # comes before others in the source
+    assert place.done()["run"]["changed"] == 0
+    assert {row["participant"]: row["file"] for row in place.rows("episodes")} == before
 
 
 def test_foreign_folders_and_wrong_options_are_refused(place: Place, tmp_path: Path) -> None:

@@ -16,11 +16,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from hippodrome.export import table_files, tables
-from hippodrome.export.answers import MAX_LINK, StudyAnswers
+from hippodrome.export.answers import MAX_LINK, Answers, LongAnswers
 from hippodrome.export.keys import KeyKind, Listed, read
+from hippodrome.export.records import Record, SourceFile
 from hippodrome.export.scrub import Scrub, clean, identities
-from hippodrome.export.state import ExportedParticipant, ExportState, SourceFile
+from hippodrome.export.table_files import Column, Style, Table, TableFile
+from hippodrome.export.tables import Identities
 from hippodrome.trial.recordings.recording import line
 from testing.exploration import examples
 from tests.export.data_world import PROJECT, TIME, answer, participant
@@ -52,28 +53,47 @@ ANYTHING = st.recursive(
 QUICK = settings(max_examples=examples(60))
 
 
-def filled(people: Mapping[str, Mapping[str, Any]], apart: bool = False, **changes: Any) -> ExportState:
-    """Make a state like one that a run leaves."""
-    state = ExportState(None)
-    state.begin_run()
-    for user, steps in people.items():
-        state.find_or_add(user, apart)
-        made = [SourceFile(f"{user}/participant.json", "participant", "1", 1, document=participant(user, **changes))]
-        for step, sent in steps.items():
-            made.append(SourceFile(f"{user}/{step}", "answer", "1", 1, step=step, document=answer(step, sent)))
-        state.save(user, [], made)
-    return state
+def filled(people: Mapping[str, Mapping[str, Any]], **changes: Any) -> list[Record]:
+    """Make records like those that a run leaves, in their order."""
+    records = []
+    for user, steps in sorted(people.items()):
+        files = [SourceFile("p", KeyKind.PARTICIPANT, "1", document=participant(user, **changes))]
+        files += [
+            SourceFile(step, KeyKind.ANSWER, "1", step, document=answer(step, sent)) for step, sent in steps.items()
+        ]
+        records.append(Record(user, user, user, {file.key: file for file in files}))
+    return records
+
+
+def seen(records: list[Record], apart: bool = False) -> Answers:
+    """Return the table of answers, with its columns."""
+    answers = Answers(PROJECT, apart)
+    for record in records:
+        if apart:
+            record.without_identities()
+        answers.see(record)
+    return answers
+
+
+def rows_of(table: Table, records: list[Record]) -> list[Any]:
+    return [row for record in records for row in table.rows(record)]
 
 
 def written(
-    state: ExportState, folder: Path, apart: bool = False, **style: Any
+    records: list[Record], folder: Path, apart: bool = False, **style: Any
 ) -> tuple[list[dict[str, str]], list[Any]]:
     """Write the answers, and read them back from CSV and from Parquet."""
-    answers = StudyAnswers(state, PROJECT, apart)
-    sheet, parquet = table_files.write(folder / "answers", answers.columns, answers.rows(), table_files.Style(**style))
+    answers = seen(records, apart)
+    sheet, parquet = write(folder / "answers", answers.columns, rows_of(answers, records), Style(**style))
     with sheet.open(encoding="utf-8-sig", newline="") as file:
         found = list(csv.DictReader(file))
     return found, pq.read_table(parquet).to_pylist()
+
+
+def write(base: Path, columns: Any, rows: Any, style: Style) -> list[Path]:
+    with TableFile(base, columns, style) as file:
+        file.add(rows)
+    return file.paths
 
 
 def as_sent(typed: Any, sent: str) -> Any:
@@ -83,10 +103,10 @@ def as_sent(typed: Any, sent: str) -> Any:
 
 
 def test_columns_stand_in_the_order_of_the_study_and_of_its_pages(tmp_path: Path) -> None:
-    state = filled(
+    records = filled(
         {"b": {"4": {"z": "1", "a": "2"}, "1": {"consent": "yes"}}, "a": {"old": {"x": "1"}, "4": {"z": "3"}}}
     )
-    (first, second), _ = written(state, tmp_path)
+    (first, second), _ = written(records, tmp_path)
     assert [name for name in first if name[0].isdigit() or name.startswith("old")] == [
         "1.consent",
         "4.z",
@@ -114,9 +134,9 @@ def test_it_says_when_a_last_page_with_fields_was_answered(tmp_path: Path) -> No
 @example([{"x\ud800": "1"}, {"x\ufffd": "2"}])
 @example([{"a": "1\x85\u20282"}])
 def test_tables_give_back_every_value_that_was_sent(people: list[dict[str, Any]]) -> None:
-    state = filled({f"u{number}": {"2": given} for number, given in enumerate(people)})
+    records = filled({f"u{number}": {"2": given} for number, given in enumerate(people)})
     with tempfile.TemporaryDirectory() as folder:
-        sheet, parquet = written(state, Path(folder))
+        sheet, parquet = written(records, Path(folder))
     assert len(sheet) == len(parquet) == len(people)
     for given_, row, typed in zip(people, sheet, parquet, strict=True):
         assert set(row) == set(typed)
@@ -138,14 +158,14 @@ def test_answers_of_any_type_make_a_table(steps: dict[str, Any], link: Any) -> N
     people = {"a": json.loads(json.dumps(steps)), "b": {"2": {"age": "3"}}}
     with tempfile.TemporaryDirectory() as folder:
         for apart in (False, True):
-            sheet, parquet = written(filled(people, apart, link=link), Path(folder), apart)
+            sheet, parquet = written(filled(people, link=link), Path(folder), apart)
             assert len(sheet) == len(parquet) == 2
-        state = filled(people)
-        answers = StudyAnswers(state, PROJECT, False)
-        long = list(answers.long_rows())
-        table_files.write(Path(folder) / "long", answers.LONG, long, table_files.Style())
-        columns, rows = tables.identities(state, answers.links)
-        table_files.write(Path(folder) / "who", columns, rows, table_files.Style())
+        records = filled(people)
+        answers = seen(records)
+        long = rows_of(LongAnswers(answers), records)
+        write(Path(folder) / "long", LongAnswers.columns, long, Style())
+        who = Identities(answers)
+        write(Path(folder) / "who", who.columns, rows_of(who, records), Style())
     sent = sum(len(v) if isinstance(v, list) and all(isinstance(i, str) for i in v) else v is not None
                for given_ in steps.values() for v in given_.values())  # fmt: skip
     assert len(long) == sent + 1
@@ -182,8 +202,8 @@ def test_answers_of_any_type_make_a_table(steps: dict[str, Any], link: Any) -> N
     ],
 )
 def test_a_column_has_the_narrowest_type_that_holds_its_values(tmp_path: Path, values: list[Any], kind: str) -> None:
-    state = filled({f"u{number}": {"2": {"x": value}} for number, value in enumerate(values)})
-    written(state, tmp_path)
+    records = filled({f"u{number}": {"2": {"x": value}} for number, value in enumerate(values)})
+    written(records, tmp_path)
     assert str(pq.read_schema(tmp_path / "answers.parquet").field("2.x").type) == kind
 
 
@@ -196,18 +216,18 @@ SENT_NUMBER = st.one_of(
 @given(st.lists(SENT_NUMBER, min_size=1, max_size=6))
 def test_a_number_that_a_form_sent_can_be_read_back_as_the_text_that_was_sent(sent: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        state = filled({f"u{number}": {"2": {"x": text}} for number, text in enumerate(sent)})
-        sheet, parquet = written(state, Path(folder))
+        records = filled({f"u{number}": {"2": {"x": text}} for number, text in enumerate(sent)})
+        sheet, parquet = written(records, Path(folder))
     assert [row["2.x"] for row in sheet] == sent  # CSV has what was sent, whatever its column is in Parquet
     assert [as_sent(row["2.x"], text) for row, text in zip(parquet, sent, strict=True)] == sent
 
 
 def test_only_tables_for_spreadsheets_escape_formulas(tmp_path: Path) -> None:
     sent = {str(number): text for number, text in enumerate([*HOSTILE, "-5.5", "+1e3", "1-2"])}
-    state = filled({"-user": {"2": sent}})
-    true, _ = written(state, tmp_path)
+    records = filled({"-user": {"2": sent}})
+    true, _ = written(records, tmp_path)
     assert [true[0][f"2.{name}"] for name in sent] == [clean(text) for text in sent.values()]
-    safe, typed = written(state, tmp_path, spreadsheet=True)
+    safe, typed = written(records, tmp_path, spreadsheet=True)
     for cell in safe[0].values():
         assert cell[:1] not in set("=+-@\t\r\0\uff1d") or cell in ("-5", "+49", "-5.5", "+1e3"), cell
     assert safe[0]["2.0"] == "'=1+1"
@@ -235,30 +255,31 @@ def test_the_number_of_columns_is_limited(tmp_path: Path, monkeypatch: Any) -> N
 
 
 def test_the_code_of_a_participant_whose_game_failed_is_the_one_that_they_saw(tmp_path: Path) -> None:
-    form = SourceFile("user-0001/2", "answer", "1", 1, step="2", document=answer("2", {"completionCode": "TYPED"}))
     game = {"outcome": "failed", "completionCode": "FAILED7"}
-    played = SourceFile("user-0001/3", "answer", "1", 1, step="3", document=answer("3", game, page="game"))
-    state = filled({"user-0001": {}})
-    state.save("user-0001", [], [form, played])
 
-    (row,), _ = written(state, tmp_path)
+    def records() -> list[Record]:
+        (record,) = filled({"user-0001": {"2": {"completionCode": "TYPED"}}})
+        record.files["3"] = SourceFile("3", KeyKind.ANSWER, "1", "3", document=answer("3", game, page="game"))
+        return [record]
+
+    (row,), _ = written(records(), tmp_path)
     assert (row["completionCode"], row["3.completionCode"]) == ("FAILED7", "FAILED7")
-    (hidden,), _ = written(state, tmp_path, apart=True)
+    (hidden,), _ = written(records(), tmp_path, apart=True)
     assert "FAILED7" not in hidden.values()
-    _, (identity,) = tables.identities(state, [])
+    (identity,) = rows_of(Identities(seen([])), records())
     assert identity == ["user-0001", "user-0001", "FAILED7"]
 
 
 @pytest.mark.parametrize("apart", [False, True])
 def test_headers_are_columns_only_where_identities_are(tmp_path: Path, apart: bool) -> None:
-    state = filled({"a": {}, "b": {}}, apart, headers={"user-agent": "Firefox", "x-forwarded-for": "203.0.113.7"})
-    (row, _), _ = written(state, tmp_path, apart)
+    records = filled({"a": {}, "b": {}}, headers={"user-agent": "Firefox", "x-forwarded-for": "203.0.113.7"})
+    (row, _), _ = written(records, tmp_path, apart)
     assert (row.get("header.user-agent"), "203.0.113.7" in row.values()) == (
         (None, False) if apart else ("Firefox", True)
     )
-    columns, identities = tables.identities(state, StudyAnswers(state, PROJECT, apart).links)
-    assert "203.0.113.7" in next(identities)
-    assert "header.x-forwarded-for" in [column.name for column in columns]
+    who = Identities(seen(records))
+    assert "203.0.113.7" in rows_of(who, records)[0]
+    assert Column("header.x-forwarded-for") in who.columns
 
 
 def test_finished_needs_every_step_but_the_last(tmp_path: Path) -> None:
@@ -317,7 +338,9 @@ def test_an_identity_that_is_a_word_leaves_every_text_and_every_json(identity: s
 
 def test_only_identifying_values_of_enough_characters_are_replaced() -> None:
     document = participant("user-0001", link={"PROLIFIC_PID": "5f2a77b1", "LANG": "en"})
-    known = identities(ExportedParticipant("user-0001", "p1", "p1", document))
+    known = identities(
+        Record("user-0001", "p1", "p1", {"p": SourceFile("p", KeyKind.PARTICIPANT, "1", document=document)})
+    )
     hide = Scrub(known)
     code = participant("user-0001")["completionCode"]
     assert (
@@ -332,14 +355,13 @@ def test_only_identifying_values_of_enough_characters_are_replaced() -> None:
 
 def test_csv_follows_the_standard(tmp_path: Path) -> None:
     columns = [
-        table_files.Column("a"),
-        table_files.Column("b", "texts"),
-        table_files.Column("c", "truth"),
-        table_files.Column("d", "number"),
+        Column("a"),
+        Column("b", "texts"),
+        Column("c", "truth"),
+        Column("d", "number"),
     ]
-    (sheet,) = table_files.write(
-        tmp_path / "t", columns, [['x "y"\n', ["1", "2"], True, math.inf], [None] * 4], table_files.Style(parquet=False)
-    )
+    rows = [['x "y"\n', ["1", "2"], True, math.inf], [None] * 4]
+    (sheet,) = write(tmp_path / "t", columns, rows, Style(parquet=False))
     assert sheet.read_bytes() == b'a,b,c,d\r\n"x ""y""\n",1; 2,true,inf\r\n,,,\r\n'
     assert next(csv.reader(io.StringIO(sheet.read_text()))) == ["a", "b", "c", "d"]
 
@@ -351,7 +373,7 @@ def test_files_appear_only_when_they_are_whole(tmp_path: Path) -> None:
 
     (tmp_path / "t.csv").write_text("before")
     with pytest.raises(KeyboardInterrupt):
-        table_files.write(tmp_path / "t", [table_files.Column("a")], rows(), table_files.Style())
+        write(tmp_path / "t", [Column("a")], rows(), Style())
     assert (tmp_path / "t.csv").read_text() == "before"
     assert not (tmp_path / "t.parquet").exists()
 

@@ -17,7 +17,7 @@ from hippodrome.deployment.core import options
 
 if TYPE_CHECKING:
     from hippodrome.deployment.aws.account import Account
-    from hippodrome.export.listing import Tally
+    from hippodrome.export.fetch import Tally
     from hippodrome.export.source import Source
 
 FORMATS = ("csv", "parquet", "minari")
@@ -163,9 +163,9 @@ def _bucket(account: Account, stack: str, bucket_name: str | None, project: str)
 
 
 def _check(folder: Path, as_json: bool) -> int:
-    from hippodrome.export import run as work
+    from hippodrome.export import manifest
 
-    wrong = work.check(folder)
+    wrong = manifest.check(folder)
     if as_json:
         screen.result_json({"folder": str(folder), "sound": not wrong, "wrong": wrong})
     if not wrong:
