@@ -212,7 +212,7 @@ class Answers(Table):
         ]
         row += _membership(record) if self._in_sessions else ()
         if not self._apart:
-            row.append(scrub.completion_code(record))
+            row.append(record.completion_code)
             row += [clean(link[name]) if name in link else None for name in self.links]
         row += [
             fit(fields[step][name], column.type) if name in fields.get(step, ()) else None

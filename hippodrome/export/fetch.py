@@ -211,7 +211,7 @@ class Fetcher:
     def _played(self, record: Record) -> Played:
         """Who has played the recordings of a participant or session."""
         if not record.is_session:
-            return Played(scrub.identities(record) if self._wanted.apart and record.user else {})
+            return Played(record.identities if self._wanted.apart and record.user else {})
         people: dict[int, str] = {}
         identities: dict[str, str] = {}
         try:
@@ -222,7 +222,7 @@ class Fetcher:
             theirs = self._records.of(member.user_id) if member.user_id else None
             if theirs and theirs.folder in self._seen:
                 people[member.seat] = theirs.number
-                identities |= scrub.identities(theirs) if self._wanted.apart else {}
+                identities |= theirs.identities if self._wanted.apart else {}
         return Played(identities, people)
 
     def _fetch(self, record: Record, item: Item, file: SourceFile, played: Played | None = None) -> None:

@@ -16,9 +16,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from hippodrome.export import scrub
 from hippodrome.export.keys import ASSIGNED, ENDED, KeyKind
 from hippodrome.export.manifest import ExportedFile
+from hippodrome.export.scrub import Scrub, clean, texts
 from hippodrome.protocol.answer import GAME
 from hippodrome.protocol.session import is_session_id
 
@@ -115,6 +115,25 @@ class Record:
                 return code
         return ""
 
+    @property
+    def _codes(self) -> list[str]:
+        """The participant's codes, first the one that they were shown: that of a game that failed comes before that of
+        an unmatched participant, in `session.json`, and this before that in `participant.json`."""
+        documents = (document.get("completionCode") for document in (self.membership, self.document))
+        return [code for code in (self.failed_code, *documents) if isinstance(code, str) and code]
+
+    @property
+    def completion_code(self) -> str | None:
+        """The completion code that the participant was shown."""
+        return next(map(clean, self._codes), None)
+
+    @property
+    def identities(self) -> dict[str, str]:
+        """The texts that identify the participant, each with its replacement: the id, the values of the link, and the
+        completion codes."""
+        link = {value: f"({name})" for name, value in texts(self.document.get("link")).items()}
+        return {**link, **dict.fromkeys(self._codes, "(completionCode)"), self.user: self.number}
+
     def recordings(self) -> list[SourceFile]:
         """The converted recordings, in the order of their paths."""
         return sorted((file for file in self.files.values() if file.made), key=lambda file: file.path)
@@ -130,7 +149,7 @@ class Record:
     def without_identities(self) -> int:
         """Replace the participant's identities in their answers; return how many were replaced. An assignment and an
         end hold words of the study alone."""
-        hide = scrub.Scrub(scrub.identities(self))
+        hide = Scrub(self.identities)
         for step, document in self.documents.items():
             if step not in (ASSIGNED, ENDED):
                 self.documents[step] = hide.value(document)

@@ -9,10 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from hippodrome.export.records import Record
+from typing import Any
 
 SHORTEST = 6  # characters; a shorter identity would be found in too many texts by chance
 OWN_FIELDS = frozenset(
@@ -123,26 +120,6 @@ class Scrub:
     def _replace(self, found: re.Match[str]) -> str:
         self.found += 1
         return self._replacements.get(found[0]) or self._replacements.get(found[0].lower(), "(id)")
-
-
-def identities(participant: Record) -> dict[str, str]:
-    """Return the texts that identify a participant, each with its replacement: the id, the values of the link, and the
-    completion codes."""
-    found = {value: f"({name})" for name, value in texts(participant.document.get("link")).items()}
-    found |= dict.fromkeys(_codes(participant), "(completionCode)")
-    return {**found, participant.user: participant.number}
-
-
-def completion_code(participant: Record) -> str | None:
-    """Return the completion code that the participant was shown."""
-    return next((clean(code) for code in _codes(participant)), None)
-
-
-def _codes(participant: Record) -> list[str]:
-    """The codes of a participant, first the one that they were shown: that of a game that failed comes before that of
-    an unmatched participant, in `session.json`, and this before that in `participant.json`."""
-    documents = (document.get("completionCode") for document in (participant.membership, participant.document))
-    return [code for code in (participant.failed_code, *documents) if isinstance(code, str) and code]
 
 
 def texts(link: Any) -> dict[str, str]:

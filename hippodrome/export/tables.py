@@ -268,7 +268,7 @@ class Identities(Table):
         if record.is_participant:
             link = scrub.columns(record.document)
             known = (clean(link[name]) if name in link else None for name in self._answers.links)
-            yield [record.number, record.user, scrub.completion_code(record), *known]
+            yield [record.number, record.user, record.completion_code, *known]
 
 
 class Problems(Table):
@@ -303,7 +303,7 @@ class Problems(Table):
             return f"{top}/{owner}/{rest}" if rest and is_session_id(owner) else "(somewhere in sessions/)"
         if not record.is_participant:
             return "(somewhere in users/)"
-        return f"{record.number}/{scrub.Scrub(scrub.identities(record)).text(rest or '(another file)')}"
+        return f"{record.number}/{scrub.Scrub(record.identities).text(rest or '(another file)')}"
 
 
 _ANSWER = re.compile(r"[A-Za-z0-9_-]{1,64}(\.[0-9]{1,4})?\.json")

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hippodrome.export.answers import MAX_LINK, Answers, LongAnswers
 from hippodrome.export.keys import KeyKind, Listed, read
 from hippodrome.export.records import Record, SourceFile
-from hippodrome.export.scrub import Scrub, clean, identities
+from hippodrome.export.scrub import Scrub, clean
 from hippodrome.export.table_files import Column, Style, Table, TableFile
 from hippodrome.export.tables import Identities
 from hippodrome.trial.recordings.recording import line
@@ -338,10 +338,8 @@ def test_an_identity_that_is_a_word_leaves_every_text_and_every_json(identity: s
 
 def test_only_identifying_values_of_enough_characters_are_replaced() -> None:
     document = participant("user-0001", link={"PROLIFIC_PID": "5f2a77b1", "LANG": "en"})
-    known = identities(
-        Record("user-0001", "p1", "p1", {"p": SourceFile("p", KeyKind.PARTICIPANT, "1", document=document)})
-    )
-    hide = Scrub(known)
+    file = SourceFile("p", KeyKind.PARTICIPANT, "1", document=document)
+    hide = Scrub(Record("user-0001", "p1", "p1", {"p": file}).identities)
     code = participant("user-0001")["completionCode"]
     assert (
         hide.text(f"I am 5F2A77B1, USER-0001, my code is {code}; en")
