@@ -151,7 +151,7 @@ def test_a_recording_is_read_as_hippos_pickles_were(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [0, 2])
 def test_the_agents_shown_keep_the_contract(tmp_path: Path, number: int) -> None:
     from hippodrome.trial.agent.agent import AgentAdapter
-    from hippodrome.trial.agent.starting import start
+    from hippodrome.trial.agent.joint import start
 
     (tmp_path / "agent.py").write_text(code("docs/agent.md", "python")[number])
     names = ("noop", "up", "right", "down", "left")
@@ -174,9 +174,8 @@ def test_the_agent_shown_with_several_players_keeps_the_contract(tmp_path: Path)
     import types
 
     from hippodrome.trial.agent.agent import AgentAdapter
-    from hippodrome.trial.agent.joint import JointAdapter
-    from hippodrome.trial.agent.starting import start
-    from hippodrome.trial.policies.load import load
+    from hippodrome.trial.agent.joint import JointAdapter, start
+    from hippodrome.trial.policies.places import load
 
     agent, partner = code("docs/players.md", "python")
     (tmp_path / "agent.py").write_text(agent)

@@ -17,7 +17,7 @@ TOKEN = "TOKEN"  # noqa: S105 - a variable's name
 GAME_STEPS = "GAME_STEPS"
 """Keys of the game steps, separated by commas: `3` or `2,4`."""
 STORE = "STORE"
-"""Where the server stores documents: a folder, or the address that signs requests (trial/recordings/presigned.py)."""
+"""Where the server stores documents: a folder, or the address that signs requests (trial/recordings/store.py)."""
 
 # The participant. A warm server reads its participant and group in its handover.
 

@@ -1,4 +1,4 @@
-"""The assumption of `hippodrome/trial/wire/round_trips.py`: a browser answers pings by itself, even while its page is busy."""
+"""The assumption of `hippodrome/trial/wire/connection.py`: a browser answers pings by itself, even while its page is busy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from websockets.asyncio.server import ServerConnection, serve
 
-from hippodrome.trial.wire import round_trips
+from hippodrome.trial.wire import connection
 from tests.browser.world import PATIENCE
 
 WANTED = 10  # round trips while the page is busy
@@ -36,7 +36,7 @@ class Pinging(threading.Thread):
 
     async def _serve(self) -> None:
         async def handle(websocket: ServerConnection) -> None:
-            await round_trips.measure(websocket, 1000, self.reports.append)
+            await connection.measure_round_trips(websocket, 1000, self.reports.append)
 
         async with serve(handle, "127.0.0.1", 0, ping_interval=None) as server:
             self.port = server.sockets[0].getsockname()[1]
@@ -101,4 +101,4 @@ def test_a_busy_page_does_not_delay_the_browsers_pongs(
     }""")
     page.close()
     assert len(meanwhile) >= WANTED
-    assert max(meanwhile) < round_trips.MAX_SECONDS, "each was answered while the page was busy"
+    assert max(meanwhile) < connection.MAX_ROUND_TRIP, "each was answered while the page was busy"

@@ -7,7 +7,7 @@ from pathlib import Path
 import yaml
 
 from hippodrome.local.rehearsal.study_process import copy_of
-from hippodrome.trial.policies.load import _file
+from hippodrome.trial.policies.places import _file
 
 CONFIG = """
 project: {id: pair, name: Pair, steps: {1: hello, 2: game, finalStep: bye}}

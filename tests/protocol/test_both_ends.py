@@ -30,8 +30,7 @@ from hippodrome.protocol import environment
 from hippodrome.protocol.answer import Answer, to_json
 from hippodrome.protocol.handover import Handover, parse
 from hippodrome.protocol.keys import answer_key, handover_key, recordings_folder
-from hippodrome.trial.recordings.recorder import Recorder
-from hippodrome.trial.recordings.spool import Spool
+from hippodrome.trial.recordings.recorder import Recorder, Spool
 from hippodrome.trial.recordings.store import FolderStore
 from hippodrome.trial.server import assignment
 from hippodrome.trial.settings import SettingsError, TrialSettings, trial_section

@@ -47,7 +47,7 @@ def own():
     """The server's own credential: from what the process was started with, or from its memory."""
     started = dict(line.split("=", 1) for line in Path("/proc/self/environ").read_text().split("\0") if "=" in line)
     GOT["environment"] = sorted(set(os.environ) & {"TOKEN", "CREDENTIAL", "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI"})
-    from hippodrome.trial.recordings.presigned import PresignedStore
+    from hippodrome.trial.recordings.store import PresignedStore
     stores = [found for found in gc.get_objects() if isinstance(found, PresignedStore)]
     return stores[0]._url, stores[0]._server, stores[0]._credential, started.get("TOKEN", "")
 

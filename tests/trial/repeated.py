@@ -15,9 +15,8 @@ from typing import Any, ClassVar, Self
 
 from hippodrome.protocol.trial import TrialSection as Section
 from hippodrome.trial.agent.agent import AgentAdapter
-from hippodrome.trial.agent.joint import JointAdapter
+from hippodrome.trial.agent.joint import JointAdapter, start
 from hippodrome.trial.agent.joint_calls import JointCalls
-from hippodrome.trial.agent.starting import start
 from hippodrome.trial.core import messages
 from hippodrome.trial.core.effects import Call, OpenRecording, RecordLine, ResetPolicy, SaveAnswer, WriteLine
 from hippodrome.trial.core.players import Player, who_plays

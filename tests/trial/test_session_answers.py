@@ -7,8 +7,7 @@ import pytest
 
 from hippodrome.protocol.session import Member, SessionDocument
 from hippodrome.trial.core.session import PARTNER_STOPPED
-from hippodrome.trial.recordings.recorder import Recorder
-from hippodrome.trial.recordings.spool import Spool
+from hippodrome.trial.recordings.recorder import Recorder, Spool
 from hippodrome.trial.recordings.store import FolderStore
 from hippodrome.trial.server import assignment
 from hippodrome.trial.settings import TrialSettings

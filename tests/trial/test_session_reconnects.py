@@ -6,7 +6,7 @@ import time
 
 from websockets.exceptions import ConnectionClosed
 
-from hippodrome.trial.wire.reconnects import AT_ONCE, SECONDS_EACH
+from hippodrome.trial.server.admission import AT_ONCE, SECONDS_EACH
 from tests.trial.sessions import hello_of, launch_formed, member, recordings
 
 ON = {"afterAbsent": "policy", "substitute": "random"}

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from hippodrome.protocol.exits import LATE_AGENT, NO_AGENT
-from hippodrome.trial.agent.agent import Agent, AgentAdapter
+from hippodrome.trial.agent.agent import AgentAdapter
+from hippodrome.trial.agent.loading import Agent
 from hippodrome.trial.core.trial import TRIAL_FAILED
 
 BASE = """

@@ -18,7 +18,7 @@ from hippodrome.protocol.exits import NO_AGENT
 from hippodrome.protocol.handover import BadHandover, Handover
 from hippodrome.protocol.keys import handover_key
 from hippodrome.trial.server import assignment
-from hippodrome.trial.server.watchdog import Watchdog
+from hippodrome.trial.server.lifetime import Watchdog
 from hippodrome.trial.settings import SettingsError, TrialSettings
 from testing.waiting import PATIENCE, until_async
 

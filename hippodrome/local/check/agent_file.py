@@ -11,7 +11,7 @@ from hippodrome.control.config.layout import AGENT
 from hippodrome.control.model.matching import MATCH
 from hippodrome.local.check.wording import short
 from hippodrome.protocol.similar import SIMILAR, did_you_mean
-from hippodrome.trial.agent.callback_names import NAMES
+from hippodrome.trial.agent.signatures import NAMES
 
 _METHODS = ("start", "step", "render", "reset", "close", "feedback", "to_act")
 _SIMILAR_METHODS = 0.8  # as similar as `rest` and `reset`: a class may have methods for itself

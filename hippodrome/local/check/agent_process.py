@@ -30,12 +30,12 @@ from hippodrome.protocol.trial_llm import LlmSection
 from hippodrome.protocol.trial_sections import AI
 from hippodrome.protocol.values import printable
 from hippodrome.trial.agent import environments, match
-from hippodrome.trial.agent.agent import AgentAdapter, AgentError
-from hippodrome.trial.agent.callback_names import MODERATE, REPLY
+from hippodrome.trial.agent.agent import AgentAdapter
 from hippodrome.trial.agent.callbacks import Callbacks, TrialFacts
-from hippodrome.trial.agent.joint import JointAdapter
+from hippodrome.trial.agent.joint import JointAdapter, start
+from hippodrome.trial.agent.loading import AgentError
 from hippodrome.trial.agent.replies import TalkOfAgent
-from hippodrome.trial.agent.starting import start
+from hippodrome.trial.agent.signatures import MODERATE, REPLY
 from hippodrome.trial.core.players import Player, who_plays
 from hippodrome.trial.llm.endpoint import Endpoint, Game, NoTape
 from hippodrome.trial.llm.ledger import Ledger, Moment

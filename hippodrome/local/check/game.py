@@ -22,8 +22,7 @@ from hippodrome.trial.agent.joint import Joint, JointAdapter
 from hippodrome.trial.core.players import PLAYER, Player, legal_actions, policy_seed
 from hippodrome.trial.core.policies import Observed
 from hippodrome.trial.policies.places import load_policies
-from hippodrome.trial.policies.policy import Policy
-from hippodrome.trial.policies.simple import AgentPolicy
+from hippodrome.trial.policies.policy import AgentPolicy, Policy
 
 BEGUN = 5  # steps of an episode with the options of another game or level
 STAYS = 20  # steps for which a substitute plays in one place

@@ -1,12 +1,9 @@
-"""Loads the researcher's `Agent`, or else the default one, calls its methods and reads what they return."""
+"""Calls the methods of the researcher's agent, which has one player, and reads what they return."""
 
 from __future__ import annotations
 
-import difflib
-import importlib.util
 import math
 import os
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,29 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from hippodrome.protocol import server_modules
-from hippodrome.protocol.similar import nearest
 from hippodrome.protocol.trial import TALK
-from hippodrome.trial.agent import callbacks, environments, import_path, signatures
-from hippodrome.trial.agent.callback_names import FEEDBACK, TALK_METHODS
-from hippodrome.trial.agent.hippo_config import hippo_config
-from hippodrome.trial.agent.signatures import Signature, UnfitSignature
-from hippodrome.trial.agent.talk_game import TalkGame
+from hippodrome.trial.agent import callbacks, environments, signatures
+from hippodrome.trial.agent.loading import METHODS, Agent, AgentError, TalkGame, hippo_config, load, missing_methods
+from hippodrome.trial.agent.signatures import FEEDBACK, TALK_METHODS, Signature, UnfitSignature
 from hippodrome.trial.core.players import PLAYER
-from hippodrome.trial.pictures.picture import Picture
-from hippodrome.trial.pictures.reader import PictureReader
+from hippodrome.trial.pictures.reader import Picture, PictureReader
 
-_METHODS = ("start", "step", "render", "reset", "close")
 _HIPPO_KEYS = frozenset({"observation", "reward", "done", "info"})  # what step() of HIPPO's sample agent returns
 _KNOWN_KEYS = _HIPPO_KEYS | {"terminated", "truncated", "action"}
-_OLD_GYM = Path(__file__).with_name("old_gym")
-_OLD_ATARI = re.compile(r"[A-Z]\w*-v[04]")
 _ENV_METHODS = ("step", "render", "reset", "close")
 """The methods that a class Agent may lack: the environment's own method is called then."""
-
-
-class AgentError(Exception):
-    """The researcher's code does not do what docs/agent.md asks of it. The message is for the researcher."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,113 +37,6 @@ class StepResult:
     action: int | None = None
     extra: Mapping[str, Any] | None = None
     """Further entries of the dict that `step` returned; None if there are none."""
-
-
-class Agent:
-    """The agent of a project without an agent.py. Its environment takes the human's actions."""
-
-    def __init__(self) -> None:
-        self.env: Any = None
-
-    def start(self, game: str) -> Any:
-        """Make and return the environment `game`.
-
-        `game` is an id of Gymnasium (ale_py is imported for ids of Atari games, old ones too), or the name of a module
-        that has `parallel_env` or `env`, such as `pettingzoo.butterfly.cooperative_pong_v6`. Raises AgentError if the
-        module does not exist or makes no environment, and Gymnasium's error if there is no such id.
-        """
-        import gymnasium  # noqa: PLC0415 - a researcher's own agent may need no Gymnasium
-
-        if environments.is_module(game) and game not in gymnasium.registry:
-            try:
-                self.env = environments.made_by_module(game)
-            except environments.PlayersUnknown as error:
-                raise AgentError(str(error)) from None
-            return self.env
-        if game.startswith("ALE/") or (game not in gymnasium.registry and _OLD_ATARI.match(game)):
-            import ale_py  # noqa: PLC0415
-
-            gymnasium.register_envs(ale_py)
-        self.env = gymnasium.make(game, render_mode="rgb_array")
-        return self.env
-
-    def step(self, action: int) -> Any:
-        """Take the human's action. Return observation, reward, terminated, truncated and info."""
-        return self.env.step(action)
-
-    def render(self) -> Any:
-        """Return the present picture: height x width x 3 bytes."""
-        return self.env.render()
-
-    def reset(self, seed: int | None = None) -> Any:
-        """Begin an episode. Return its first observation and info."""
-        return self.env.reset(seed=seed)
-
-    def close(self) -> None:
-        """Close the environment."""
-        self.env.close()
-
-
-def load(folder: Path, *, talks: bool = False) -> Any:
-    """Return the agent of a project folder.
-
-    That is an object of the class `Agent` in the folder's agent.py; or the module agent.py itself, if it has no such
-    class but the five functions; or the default agent, if there is no agent.py. agent.py can import the files beside
-    it, and `gym`. With `talks` the class needs no `start`. Raises AgentError if methods or functions are missing or a
-    file hides a module that servers need, and whatever agent.py itself raises.
-    """
-    path = folder / "agent.py"
-    if not path.is_file():
-        return Agent()
-    if hiding := server_modules.hiding(folder):  # what a server loads from now on would be the researcher's
-        raise AgentError("; ".join(hiding))
-    import_path.add(folder)
-    if str(_OLD_GYM) not in sys.path:
-        sys.path.append(str(_OLD_GYM))  # last, so that it hides no Gym that is installed
-    sys.argv = [
-        path.name
-    ]  # for an agent that reads arguments: not the arguments of this process, which differ between check and server
-    spec = importlib.util.spec_from_file_location("agent", path)
-    if spec is None or spec.loader is None:
-        raise AgentError(f"{path.name} cannot be imported")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["agent"] = module
-    spec.loader.exec_module(module)
-    agent_class = getattr(module, "Agent", None)
-    if isinstance(agent_class, type):
-        missing = _missing(agent_class)
-        misspelt = {name: near for name in missing for near in _similar_methods(name, agent_class)}
-        if misspelt or ("start" in missing and not talks):
-            hint = "".join(f"; is {near} meant to be {name}?" for name, near in misspelt.items())
-            raise AgentError(f"Agent in {path.name} has no {', '.join(misspelt or missing)}{hint}")
-        return agent_class()
-    missing = _missing(module)
-    if len(missing) == len(_METHODS):
-        raise AgentError(f"{path.name} has no class Agent{_question_about_class(module)}")
-    if missing:
-        raise AgentError(
-            f"{path.name} has no class Agent, and of its functions no {', '.join(missing)}; write these, or a class"
-        )
-    return module
-
-
-def _missing(methods: Any) -> list[str]:
-    return [name for name in _METHODS if not callable(getattr(methods, name, None))]
-
-
-def _question_about_class(module: Any) -> str:
-    """Return a question about a class of the module with a name similar to `Agent`; empty if there is none."""
-    near = nearest("Agent", (name for name, found in vars(module).items() if isinstance(found, type)))
-    return f"; is {near} meant to be Agent?" if near else ""
-
-
-def _similar_methods(name: str, agent_class: type) -> list[str]:
-    """Return the method of the class whose name is most similar to `name`, as a list; empty if none is similar."""
-    # `load` refuses an agent with such a method, so the names must be more similar than for a mere question
-    # (`hippodrome/protocol/similar.py`).
-    members = {other: getattr(agent_class, other, None) for other in dir(agent_class) if not other.startswith("_")}
-    others = [other for other, member in members.items() if callable(member)]
-    return difflib.get_close_matches(name, set(others) - set(_METHODS), n=1, cutoff=0.88)
 
 
 class AgentAdapter:
@@ -185,7 +63,7 @@ class AgentAdapter:
         self.reader = reader or PictureReader()
         self._agent: Any = None
         self._returned: Any = None  # the result of start()
-        self._signatures: dict[str, Signature] = {name: signatures.usual(name) for name in _METHODS}
+        self._signatures: dict[str, Signature] = {name: signatures.usual(name) for name in METHODS}
         self._unusual_step: Callable[[Any], Any] | None = None
         self._unusual_render = False  # `render` has parameters, or it is the environment's method
         self._env_methods: dict[str, Callable[..., Any]] = {}  # methods of the environment that the agent lacks
@@ -230,7 +108,7 @@ class AgentAdapter:
         called, and whatever its own code raises.
         """
         agent = load(self._folder, talks=self._game == TALK)
-        missing = _missing(agent)
+        missing = missing_methods(agent)
         if isinstance(agent, Agent) and self._game == TALK:
             returned = agent.env = TalkGame(players)
         elif "start" in missing:

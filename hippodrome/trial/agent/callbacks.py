@@ -15,7 +15,8 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from hippodrome.trial.agent.callback_names import (
+from hippodrome.trial.agent.replies import NoChat, TalkOfAgent
+from hippodrome.trial.agent.signatures import (
     EPISODE_END,
     EPISODE_START,
     FEEDBACK,
@@ -24,7 +25,6 @@ from hippodrome.trial.agent.callback_names import (
     SESSION_START,
     TICK,
 )
-from hippodrome.trial.agent.replies import NoChat, TalkOfAgent
 from hippodrome.trial.core.players import PLAYER
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.recorded_values import text_of

@@ -7,16 +7,17 @@ player. Here a player's name is a text. The environment's own key of a player ma
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from hippodrome.trial.agent import environments
-from hippodrome.trial.agent.agent import AgentAdapter, AgentError
+from hippodrome.trial.agent.agent import AgentAdapter
 from hippodrome.trial.agent.environments import Players
+from hippodrome.trial.agent.loading import AgentError
 from hippodrome.trial.core.players import ACTION_MASK, ALL
-from hippodrome.trial.pictures.picture import Picture
+from hippodrome.trial.pictures.reader import Picture
 
 TO_ACT = "to_act"
 _TO_ACT_IS = f"{TO_ACT} of %s is"
@@ -358,3 +359,30 @@ def _read(result: Any) -> _Returned:
             raise AgentError(f"{_WANTED}; its {name} are {type(part).__name__}{for_all}")
     observations, rewards, terminated, truncated, infos = (part or {} for part in parts)
     return _Returned(observations, rewards, terminated, truncated, infos, extra)
+
+
+def start(adapter: AgentAdapter, players: Sequence[str] = ()) -> AgentAdapter | JointAdapter:
+    """Start the agent's game. Return the adapter itself if the game has one player, else a JointAdapter.
+
+    `players` are the names in `trial.players`. The game has several players if the environment (`adapter.env`) or the
+    agent has `possible_agents`, or if `players` has more than one name. But an agent with a `step` of its own may play
+    the others itself: its game has one player unless `players` or its own `possible_agents` name several. Raises
+    AgentError, and whatever the researcher's code raises.
+    """
+    adapter.start(players)
+    env = adapter.env
+    keys = environments.player_keys(adapter.agent)
+    if not keys and (len(players) > 1 or not adapter.steps_itself):
+        keys = environments.player_keys(env)
+    if not keys and len(players) > 1:
+        keys = list(players)
+    if not keys:
+        adapter.name_actions()
+        return adapter
+    try:
+        found = environments.players_of(
+            adapter.agent if env is None else env, keys, adapter.configured_actions, stepped=not adapter.steps_itself
+        )
+    except environments.PlayersUnknown as error:
+        raise AgentError(str(error)) from None
+    return JointAdapter(adapter, found)

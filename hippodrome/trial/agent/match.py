@@ -8,7 +8,7 @@ from types import ModuleType
 from typing import Any
 
 from hippodrome.trial.agent import signatures
-from hippodrome.trial.agent.agent import AgentError
+from hippodrome.trial.agent.loading import AgentError
 
 NAME = "match"
 SECONDS = 5.0

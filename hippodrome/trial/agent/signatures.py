@@ -1,4 +1,4 @@
-"""Finds out which arguments the methods of a researcher's agent take: the environment, a seed, the game …
+"""The methods of a researcher's agent: the callbacks' names, and which arguments each method takes.
 
 HIPPO's documentation has `step(env, action)`, its sample agents have `step(action)`, and its first version has
 functions of a module. The parameters of a method are read once, by `inspect.signature`, when the agent is loaded.
@@ -11,9 +11,26 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+SESSION_START = "on_session_start"
+SESSION_END = "on_session_end"
+EPISODE_START = "on_episode_start"
+EPISODE_END = "on_episode_end"
+TICK = "on_tick"
+FEEDBACK = "on_feedback"
+JOIN = "on_join"
+LEAVE = "on_leave"
+RETURN = "on_return"
+FORM = "on_form"
+NAMES = (SESSION_START, SESSION_END, EPISODE_START, EPISODE_END, TICK, FEEDBACK, JOIN, LEAVE, RETURN, FORM)
+"""The callbacks, which are methods of the agent (`callbacks.py`)."""
+REPLY = "reply"
+MODERATE = "moderate"
+TALK_METHODS = (REPLY, MODERATE)
+"""Methods for what is said (`replies.py`). They run on threads of their own."""
+
 GAME, ENV, ACTION, WORD, SEED, OPTIONS, MODE = "game", "env", "action", "word", "seed", "options", "mode"
 CONFIG, PLAYER, ANSWERS = "config", "player", "answers"
-"""The kinds of arguments. CONFIG is the section `trial` in HIPPO's form (`hippo_config.py`). PLAYER is the player
+"""The kinds of arguments. CONFIG is the section `trial` in HIPPO's form (`loading.hippo_config`). PLAYER is the player
 whose view `render` draws, ANSWERS the answers to earlier steps that the game's key `answers` names. WORD is the newest
 word of feedback since the last step, or NO_WORD."""
 

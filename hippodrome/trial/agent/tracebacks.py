@@ -1,10 +1,11 @@
-"""Formats errors of the researcher's code for the log."""
+"""Formats errors of the researcher's code for the log, and keeps participants' ids out of it."""
 
 from __future__ import annotations
 
+import logging
 import re
 import traceback
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 _OURS = Path(__file__).resolve().parents[1]
@@ -20,7 +21,7 @@ def report(error: BaseException, folder: Path, private: Iterable[str] = ()) -> s
     frames = whole[: -len(last)] if whole[-len(last) :] == last else whole
     indented = [part for part in last if part.startswith(" ")]  # a SyntaxError quotes the line of the file
     message = " ".join("".join(part for part in last if part not in indented).split())
-    message = message.removeprefix("hippodrome.trial.agent.agent.").removeprefix("hippodrome.trial.core.effects.")
+    message = message.removeprefix("hippodrome.trial.agent.loading.").removeprefix("hippodrome.trial.core.effects.")
     place = where(error, folder)
     return without(private, "".join([*frames, *indented]) + (f"{place}: {message}" if place else message))
 
@@ -65,3 +66,17 @@ def without(private: Iterable[str], text: str) -> str:
     if not ids:
         return text
     return re.sub(rf"(?<!\w)(?:{'|'.join(map(re.escape, ids))})(?!\w)", "(participant)", text)
+
+
+class IdFilter(logging.Filter):
+    """Removes participants' ids from the logger's lines and tracebacks. `ids` returns the ids of those who play now."""
+
+    def __init__(self, ids: Callable[[], Iterable[str]]) -> None:
+        super().__init__()
+        self._ids = ids
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        record.msg, record.args = without(self._ids(), record.getMessage()), None
+        if record.exc_info:  # handlers write `exc_text` if it is there, and make none of their own
+            record.exc_text = without(self._ids(), logging.Formatter().formatException(record.exc_info))
+        return True

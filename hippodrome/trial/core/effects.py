@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 from hippodrome.trial.core.players import Action, Player, View
 from hippodrome.trial.core.policies import AskPolicy, Observed
 from hippodrome.trial.core.recorded import Break, Episode, UnfinishedEpisode, Word
-from hippodrome.trial.pictures.picture import Picture
+from hippodrome.trial.pictures.reader import Picture
 
 Pictures = Picture | dict[str, Picture]
 """One picture for all humans, or one for each player that a human plays, by player."""

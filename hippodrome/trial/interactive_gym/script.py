@@ -14,7 +14,7 @@ from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
-from hippodrome.trial.agent import import_path
+from hippodrome.trial.agent.loading import add_to_path
 from hippodrome.trial.interactive_gym.options import RemoteConfig, Unplayable
 from hippodrome.trial.interactive_gym.scenes import game_of
 
@@ -89,7 +89,7 @@ def load(script: str, arguments: Sequence[str], folder: Path) -> tuple[RemoteCon
     if _Finder not in sys.meta_path:
         sys.meta_path.insert(0, _Finder)
     path = folder / script
-    import_path.add(path.parent, folder)
+    add_to_path(path.parent, folder)
     name = ".".join(Path(script).with_suffix("").parts)
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or not path.is_file():

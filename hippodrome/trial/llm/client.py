@@ -2,16 +2,35 @@
 
 from __future__ import annotations
 
+import codecs
 import http.client
 import json
 import os
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 from urllib.parse import urlsplit
 
-from hippodrome.trial.llm import events
-from hippodrome.trial.llm.errors import OWN, CapReached, ModelError, ModelRefused, ModelUnavailable
+OWN = "hippodrome"
+"""The type of the loopback address's own errors. No error of a model's API keeps it."""
+
+
+class ModelError(Exception):
+    """The model has not answered. The message says why, without words of prompts and answers."""
+
+
+class CapReached(ModelError):
+    """The game has used up `llm.maxCalls` or `llm.maxTokens`."""
+
+
+class ModelUnavailable(ModelError):
+    """The model cannot be reached, is too slow, has too much to do, or has broken off."""
+
+
+class ModelRefused(ModelError):
+    """The model's API refuses the request, or the model has declined to answer."""
+
 
 _AGAIN = (429, 500, 502, 503, 504)
 _PAUSES = (1.0, 3.0)  # seconds before a second and a third try
@@ -48,14 +67,14 @@ def stream(messages: Sequence[Mapping[str, Any]], parameters: Mapping[str, Any])
     connection, response = _opened(body)
     length, why = 0, None
     try:
-        reader = events.Reader()
+        reader = Reader()
         while piece := response.read1(65_536):
             for event in reader.feed(piece):
-                data = events.data_of(event)
+                data = data_of(event)
                 if isinstance(data, Mapping) and data.get("error"):
                     raise _error_of(502, data)
-                why = events.end_of(data) or why
-                if text := events.text_of_delta(data):
+                why = end_of(data) or why
+                if text := text_of_delta(data):
                     length += len(text)
                     yield text
     except (OSError, http.client.HTTPException) as error:
@@ -158,3 +177,76 @@ def _request(
     except (OSError, http.client.HTTPException) as error:
         connection.close()
         raise ModelUnavailable(f"the address of the model does not answer ({type(error).__name__})") from None
+
+
+# ---- server-sent events, as language models stream their answers
+
+_LINE_END = re.compile(r"\r\n|\n|\r")
+_END = re.compile(r"\r\n\r\n|\n\n|\r\r")
+
+
+class Reader:
+    """Splits a stream's bytes into events: texts without the empty line at their end."""
+
+    def __init__(self) -> None:
+        self._decoder = codecs.getincrementaldecoder("utf-8")("replace")
+        self._rest = ""
+
+    def feed(self, piece: bytes) -> Iterator[str]:
+        """Yield the events that end in this piece."""
+        *whole, self._rest = _END.split(self._rest + self._decoder.decode(piece))
+        yield from (event for event in whole if event)
+
+    def rest(self) -> str:
+        """Return what came after the last event."""
+        return self._rest.strip()
+
+
+def data_of(event: str) -> Any:
+    """Return the JSON of an event; None if it has none, as `[DONE]`."""
+    lines = [line[5:].removeprefix(" ") for line in _LINE_END.split(event) if line.startswith("data:")]
+    try:
+        return json.loads("\n".join(lines))
+    except (ValueError, RecursionError):
+        return None
+
+
+def is_usage_alone(data: Any) -> bool:
+    """Return whether this is the event with the tokens of a chat, which has no choice. Many clients expect a choice."""
+    return isinstance(data, Mapping) and data.get("choices") == [] and isinstance(data.get("usage"), Mapping)
+
+
+def text_of_delta(data: Any) -> str:
+    """Return the text that an event of a chat's stream adds to the answer."""
+    try:
+        return str(data["choices"][0]["delta"].get("content") or "")
+    except (AttributeError, IndexError, KeyError, TypeError):
+        return ""
+
+
+def length_of_delta(data: Any) -> int:
+    """Return how many characters an event of a stream adds to the answer."""
+    if isinstance(data, Mapping) and isinstance(data.get("delta"), str):  # of /responses
+        return len(data["delta"])
+    return len(text_of_delta(data))
+
+
+def length_of_answer(answer: Any) -> int:
+    """Return how many characters an answer has, roughly: those of all its texts beside names."""
+    if isinstance(answer, str):
+        return len(answer)
+    if isinstance(answer, Mapping):
+        texts = (
+            answer.get(key) for key in ("choices", "message", "content", "output", "text", "tool_calls", "arguments")
+        )
+        return sum(map(length_of_answer, texts))
+    return sum(map(length_of_answer, answer)) if isinstance(answer, list) else 0
+
+
+def end_of(data: Any) -> str | None:
+    """Return why a chat's stream ends with this event; None if it goes on."""
+    try:
+        why = data["choices"][0].get("finish_reason")
+    except (AttributeError, IndexError, KeyError, TypeError):
+        return None
+    return why if isinstance(why, str) else None

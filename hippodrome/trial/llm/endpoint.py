@@ -22,8 +22,8 @@ from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 from hippodrome.protocol.trial_llm import LlmSection
-from hippodrome.trial.llm import events
-from hippodrome.trial.llm.errors import OWN
+from hippodrome.trial.llm import client
+from hippodrome.trial.llm.client import OWN
 from hippodrome.trial.llm.ledger import Call, Ledger, Moment, Refused, Tokens, estimate, tokens_of
 from hippodrome.trial.llm.upstream import Answer, Failed, Upstream
 
@@ -272,7 +272,7 @@ class _Handler(BaseHTTPRequestHandler):
         status, found = self._read(status, body)
         tokens = Tokens()
         if status == 200:
-            tokens = tokens_of(found) or estimate(request, events.length_of_answer(found))
+            tokens = tokens_of(found) or estimate(request, client.length_of_answer(found))
         ended(status, found, tokens)
         self._send(status, found, {"Retry-After": retry_after} if retry_after and status != 200 else {})
 
@@ -303,10 +303,10 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             self._begin_stream()
             for event in self._events(answer):
-                data = events.data_of(event)
+                data = client.data_of(event)
                 tokens = tokens_of(data) or tokens
-                length += events.length_of_delta(data)
-                if not shows_usage and events.is_usage_alone(data):
+                length += client.length_of_delta(data)
+                if not shows_usage and client.is_usage_alone(data):
                     continue
                 if waiting is not None:
                     self._write_event(waiting)
@@ -323,11 +323,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _events(self, answer: Answer) -> Iterator[str]:
         """Yield the events of a stream; if it breaks off, an event with the error last."""
-        reader, without_key = events.Reader(), self.server.endpoint.without_key
+        reader, without_key = client.Reader(), self.server.endpoint.without_key
 
         def theirs(event: str) -> str:
             event = without_key(event)
-            data = events.data_of(event)
+            data = client.data_of(event)
             changed = _as_theirs(data)
             return event if changed is data else f"data: {json.dumps(changed)}"
 

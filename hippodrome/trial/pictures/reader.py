@@ -1,17 +1,36 @@
-"""Reads the pictures that `render()` returns, one after another: a scene refers to the previous scene. Pure."""
+"""Reads the pictures that `render()` returns, and draws scenes for clients that do not draw them."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hippodrome.protocol.trial_sections import SceneSection
-from hippodrome.trial.pictures import frames
+from hippodrome.trial.pictures import assets, frames
 from hippodrome.trial.pictures.assets import Assets
-from hippodrome.trial.pictures.picture import Picture, as_picture
-from hippodrome.trial.pictures.scene import Scene, images_of
+from hippodrome.trial.pictures.frames import Frame
+from hippodrome.trial.pictures.scene import Scene, SceneError, as_scene, images_of, is_scene
+
+Picture = Frame | Scene
+"""A picture that clients are shown. It must not be changed."""
+
+
+def as_picture(value: Any, before: Scene | None = None, *, scenes: bool = True) -> Picture:
+    """Read the picture that `render()` returned. `before` is the episode's last scene (see `as_scene`).
+
+    `scenes` says whether config.yml has `trial.scene`. Raises FrameError or SceneError, with a sentence for the
+    researcher.
+    """
+    if not is_scene(value):
+        return frames.as_frame(value)
+    if not scenes:
+        raise SceneError("render() returned objects; say in config.yml how large the picture is, as trial.scene")
+    return as_scene(value, before)
+
 
 _MAX_SENTENCES = 100  # the most sentences for `tell`: a long game may have ever new mistakes
 
@@ -73,3 +92,34 @@ class PictureReader:
         if sentence not in self._told and len(self._told) < _MAX_SENTENCES:
             self._told.add(sentence)
             self._tell(sentence)
+
+
+if TYPE_CHECKING:
+    from hippodrome.trial.pictures.raster import Raster
+
+log = logging.getLogger("trial")
+
+
+class Drawing:
+    """Holds the images of a project, and reads and draws its pictures.
+
+    Problems with images and objects are logged, each sentence once.
+    """
+
+    def __init__(self, section: SceneSection | None, project: Path) -> None:
+        """Read the project's images. `section` is `trial.scene`; None: no images, since `render()` returns pixels."""
+        self._section = section
+        self.assets = Assets() if section is None else assets.load(project, section.assets)
+        self.reader = PictureReader(section, self.assets, log.warning)
+        self._raster: Raster | None = None
+        for problem in self.assets.problems:
+            log.warning(problem)
+
+    def draw(self, scene: Scene) -> Frame:
+        """Draw the scene as pixels. May be called on any thread."""
+        if self._raster is None:
+            from hippodrome.trial.pictures.raster import Raster  # noqa: PLC0415 - most servers never need it
+
+            assert self._section is not None
+            self._raster = Raster(self._section, self.assets)
+        return self._raster.draw(scene)

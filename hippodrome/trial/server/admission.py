@@ -1,7 +1,7 @@
 """Admits clients: checks their first message, and tells a client that may not play now the reason.
 
-The checks are in `handshake.py`. This module decides their order, waits until the server knows who plays there, and
-checks that a member of a session has answered the game steps before.
+The checks are in `handshake.py`. This module decides their order, waits until the server knows who plays there, limits
+how often a member of a session may connect, and checks that they have answered the game steps before.
 """
 
 from __future__ import annotations
@@ -29,12 +29,16 @@ from hippodrome.trial.server.handshake import (
     tokens_for,
 )
 from hippodrome.trial.settings import TrialSettings
-from hippodrome.trial.wire.reconnects import Reconnects
 
 log = logging.getLogger("trial")
 
 NOT_ASSIGNED = "The game is not open yet. Please wait: it is tried again."
 _TOO_OFTEN = "You connect too often. Please wait: it is tried again."
+
+AT_ONCE = 30
+"""The number of connections that a member may make at once."""
+SECONDS_EACH = 2.0
+"""After AT_ONCE connections, the seconds until the member may connect once more."""
 
 
 class Admission:
@@ -127,3 +131,23 @@ async def first_of(*waits: Coroutine[Any, Any, Any]) -> None:
     finally:
         for task in tasks:
             task.cancel()
+
+
+class Reconnects:
+    """Counts the connections of each member of a session, and says when there are too many.
+
+    Each connection of a member is recorded and reported to all members, and may make a policy give the player back. Our
+    page does not reach the limit: it waits for at least half a second after each loss, and longer while it is refused.
+    """
+
+    def __init__(self) -> None:
+        self._free_at: dict[str, float] = {}
+        """By member, the time at which they may connect AT_ONCE times again."""
+
+    def allowed(self, human: str, now: float) -> bool:
+        """Return whether the member may connect now. A connection that is refused does not count."""
+        free_at = max(self._free_at.get(human, now), now)
+        if free_at - now > (AT_ONCE - 1) * SECONDS_EACH:
+            return False
+        self._free_at[human] = free_at + SECONDS_EACH
+        return True

@@ -19,7 +19,7 @@ from hippodrome.trial.core import messages
 from hippodrome.trial.core.messages import BadMessage, CloseConnection, Hello, NotAMessage
 from hippodrome.trial.server import watch
 from hippodrome.trial.settings import TrialSettings
-from hippodrome.trial.wire import notice, plain
+from hippodrome.trial.wire import plain
 from hippodrome.trial.wire.connection import SUBPROTOCOL
 from hippodrome.trial.wire.inbound import RateLimit
 
@@ -136,7 +136,7 @@ async def show_refusal(websocket: ServerConnection, words: str) -> None:
     again. Raises CloseConnection if the client sends too many messages, and ConnectionClosed.
     """
     await websocket.send(plain.sentence(words))
-    await websocket.send(notice.frame_message(words))  # instead of "please wait"
+    await websocket.send(plain.frame_message(words))  # instead of "please wait"
     rate, loop = RateLimit(REFUSED_MESSAGES_A_SECOND), asyncio.get_running_loop()
     async for _ in websocket:
         if rate.exceeded(loop.time()):

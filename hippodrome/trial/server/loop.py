@@ -12,12 +12,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from hippodrome.trial.agent.callback_names import MODERATE, REPLY, TALK_METHODS
 from hippodrome.trial.agent.callbacks import Callbacks, TrialFacts
 from hippodrome.trial.agent.calls import AgentCalls, Calls
 from hippodrome.trial.agent.joint import JointAdapter
 from hippodrome.trial.agent.joint_calls import JointCalls
 from hippodrome.trial.agent.replies import Mouth, Replies, TalkOfAgent
+from hippodrome.trial.agent.signatures import MODERATE, REPLY, TALK_METHODS
 from hippodrome.trial.agent.tracebacks import report, where, without
 from hippodrome.trial.agent.worker import Worker
 from hippodrome.trial.core.effects import (
@@ -52,15 +52,14 @@ from hippodrome.trial.core.players import Player, PlayersError
 from hippodrome.trial.core.policies import AskPolicy
 from hippodrome.trial.core.recorded import RecordedTrial
 from hippodrome.trial.core.trial import Trial
+from hippodrome.trial.llm.client import ModelError
 from hippodrome.trial.llm.endpoint import Endpoint, Game
-from hippodrome.trial.llm.errors import ModelError
 from hippodrome.trial.llm.ledger import Ledger, Moment
 from hippodrome.trial.llm.partner import NoPrompt, Partner, prompt_of
 from hippodrome.trial.policies.places import Places
 from hippodrome.trial.policies.policy import PolicyError
-from hippodrome.trial.recordings.recorder import Recorder
+from hippodrome.trial.recordings.recorder import Recorder, Spool
 from hippodrome.trial.recordings.recording import Line
-from hippodrome.trial.recordings.spool import Spool
 from hippodrome.trial.recordings.store import Store, short_error
 from hippodrome.trial.server.callbacks import TrialCallbacks
 from hippodrome.trial.server.earlier_answers import read_earlier

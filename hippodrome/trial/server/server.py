@@ -26,31 +26,29 @@ from hippodrome.protocol import assignment, exits
 from hippodrome.protocol.session import assignment_key
 from hippodrome.trial.agent import match
 from hippodrome.trial.agent.agent import AgentAdapter
-from hippodrome.trial.agent.tracebacks import report
+from hippodrome.trial.agent.tracebacks import IdFilter, report
 from hippodrome.trial.agent.worker import Worker
 from hippodrome.trial.core import messages
 from hippodrome.trial.core.effects import AgentTimeout
 from hippodrome.trial.core.messages import BadMessage, CloseConnection, CommandRefused, NotAMessage
 from hippodrome.trial.core.players import PlayersError
 from hippodrome.trial.llm.endpoint import Endpoint
+from hippodrome.trial.pictures.reader import Drawing
 from hippodrome.trial.policies.policy import PolicyError
-from hippodrome.trial.recordings.spool import Spool, store_file
+from hippodrome.trial.recordings.recorder import Spool, store_file
 from hippodrome.trial.recordings.store import Store, open_store, short_error
 from hippodrome.trial.server import watch
 from hippodrome.trial.server.admission import NOT_ASSIGNED, Admission, first_of
 from hippodrome.trial.server.assignment import AssignmentDocument, Search, set_environment
-from hippodrome.trial.server.drawing import Drawing
 from hippodrome.trial.server.handshake import check_matches, is_program, token_in_address
 from hippodrome.trial.server.lifetime import Lifetime, exit_hard_after
 from hippodrome.trial.server.listener import CLOSE_SECONDS, Listener
 from hippodrome.trial.server.loop import TrialLoop
 from hippodrome.trial.server.matching import Matching
 from hippodrome.trial.server.own_certificate import CertificateAndKey
-from hippodrome.trial.server.private_log import IdFilter
 from hippodrome.trial.server.started import StartedAgent
 from hippodrome.trial.settings import TrialSettings, trial_section
-from hippodrome.trial.wire import round_trips
-from hippodrome.trial.wire.connection import Connection
+from hippodrome.trial.wire.connection import Connection, measure_round_trips
 from hippodrome.trial.wire.inbound import Inbound
 
 log = logging.getLogger("trial")
@@ -325,7 +323,7 @@ class TrialServer:
             yield
             return
         report, samples = partial(trial.round_trip, human), trial.settings.trial.ping_samples
-        measuring = asyncio.create_task(round_trips.measure(connection.websocket, samples, report))
+        measuring = asyncio.create_task(measure_round_trips(connection.websocket, samples, report))
         try:
             yield
         finally:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from hippodrome.protocol.trial import TrialSection
-from hippodrome.trial.agent import starting
+from hippodrome.trial.agent import joint
 from hippodrome.trial.agent.agent import AgentAdapter
 from hippodrome.trial.agent.joint import JointAdapter
 from hippodrome.trial.core.players import PLAYER, Player, PlayersError, who_plays
@@ -52,7 +52,7 @@ class StartedAgent:
         researcher's code.
         """
         config = settings.trial
-        agent = starting.start(adapter, config.named_players())
+        agent = joint.start(adapter, config.named_players())
         started = cls(settings, agent, agent.callbacks)
         groups: Iterable[int | None] = () if settings.assigned else config.groups()
         for group in groups or (settings.group,):

@@ -1,9 +1,10 @@
-"""The sending half of a client's connection: decides in which order, when and in which form things are sent."""
+"""A client's connection: in which order, when and in which form things are sent, and how long a round trip takes."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import logging
 import math
 import socket
@@ -20,16 +21,19 @@ from hippodrome.trial.core.timing import Window
 from hippodrome.trial.pictures import frames
 from hippodrome.trial.pictures.assets import Assets
 from hippodrome.trial.pictures.encoder import Encoder
-from hippodrome.trial.pictures.picture import Picture
+from hippodrome.trial.pictures.reader import Picture
 from hippodrome.trial.pictures.scene import Scene
 from hippodrome.trial.pictures.scene_encoder import ASSET, ASSET_HEADER, SceneEncoder
 from hippodrome.trial.settings import STALLED_SECONDS
-from hippodrome.trial.wire.pending_talk import PendingTalk
 
 log = logging.getLogger("trial")
 
 SUBPROTOCOL = "hippodrome"
 """The subprotocol of docs/wire.md. Clients without it, such as HIPPO's front end, get HIPPO's messages."""
+MAX_ROUND_TRIP = 10.0
+"""The longest round trip that is reported. A ping without an answer counts as one of this length."""
+PING_SECONDS = 5.0
+"""The time from the answer to one ping to the next ping, after the first samples."""
 REST_SECONDS = 0.25
 """A lossy frame is made exact if no other picture follows within this time or 2.5 frames, whichever is longer."""
 
@@ -40,6 +44,8 @@ _DONE = 1000  # the close code of a trial that is over
 _TEXTS = 64  # the most messages that may wait; more are dropped
 _ASSET_PART = 65_536  # the bytes of an image in one message
 _ASSET_TIMES = 3  # how often a connection may ask for the same image
+_LINES = 500  # the most lines of talk in a message
+_BETWEEN_SAMPLES = 0.1  # seconds between the first pings
 
 
 class Connection:
@@ -261,3 +267,83 @@ def _limit_unsent(websocket: ServerConnection) -> None:
     if sock is not None and option is not None:
         with contextlib.suppress(OSError):
             sock.setsockopt(socket.IPPROTO_TCP, option, _UNSENT_BYTES)
+
+
+class PendingTalk:
+    """The messages about talk that wait for a client. Of a line, only the newest text waits."""
+
+    def __init__(self) -> None:
+        self._lines: dict[int, Mapping[str, Any]] = {}
+        self._history = False  # whether a message with lines is due, also if there are none
+        self._turn: str | None = None
+        self._typing: dict[str, bool] = {}
+        self._refused: list[Mapping[str, Any]] = []
+
+    def __bool__(self) -> bool:
+        return bool(self._lines or self._history or self._turn is not None or self._typing or self._refused)
+
+    def add(self, fields: Mapping[str, Any]) -> None:
+        """Add the fields of a message: `lines`, `turn`, `typing` or `refused`."""
+        self._history = self._history or fields.get("lines") == []
+        for line in fields.get("lines", ()):
+            self._lines.pop(line["n"], None)
+            self._lines[line["n"]] = line
+        self._turn = fields.get("turn", self._turn)
+        self._typing |= fields.get("typing", {})
+        if "refused" in fields and len(self._refused) < _LINES:
+            self._refused.append(fields["refused"])
+
+    def take(self) -> str:
+        """Return the next message to send."""
+        if self._typing:
+            typing, self._typing = self._typing, {}
+            return json.dumps({"typing": typing})
+        if self._refused:
+            return json.dumps({"refused": self._refused.pop(0)})
+        self._history = False
+        numbers = list(self._lines)[:_LINES]
+        message: dict[str, Any] = {"lines": [self._lines.pop(number) for number in numbers]}
+        if self._turn is not None and not self._lines:
+            message["turn"], self._turn = self._turn, None
+        return json.dumps(message, ensure_ascii=False)
+
+
+async def measure_round_trips(websocket: ServerConnection, samples: int, report: Callable[[float], None]) -> None:
+    """Report round trips, in seconds, until the connection is closed. They are those of WebSocket's pings.
+
+    A browser answers a ping by itself, without the page, "as soon as is practical" (RFC 6455, 5.5.2 and 5.5.3). A ping
+    waits until earlier data are sent, as the game's pictures do. So the round trip is the one that the participant
+    experiences, with the server's own delays. It takes 6 bytes to the browser and 10 back, without TCP and TLS.
+
+    The first `samples` are measured at once, the others every `PING_SECONDS`. One ping is under way at a time. While
+    it has no answer, for instance because a phone sleeps, `MAX_ROUND_TRIP` is reported every `MAX_ROUND_TRIP`.
+    """
+    count = 0
+    try:
+        while True:
+            await _measure_round_trip(websocket, report)
+            count += 1
+            await asyncio.sleep(_BETWEEN_SAMPLES if count < samples else PING_SECONDS)
+    except ConnectionClosed:
+        pass
+
+
+async def _measure_round_trip(websocket: ServerConnection, report: Callable[[float], None]) -> None:
+    """Measure and report one round trip. Raises ConnectionClosed."""
+    ping, late = asyncio.ensure_future(_round_trip(websocket)), False
+    try:
+        while True:
+            await asyncio.wait({ping}, timeout=MAX_ROUND_TRIP)
+            if ping.done():
+                break
+            late = True
+            report(MAX_ROUND_TRIP)
+    finally:
+        ping.cancel()  # changes nothing once it is done
+    seconds = ping.result()
+    if not late:
+        report(min(seconds, MAX_ROUND_TRIP))
+
+
+async def _round_trip(websocket: ServerConnection) -> float:
+    return await (await websocket.ping())

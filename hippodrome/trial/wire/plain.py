@@ -7,12 +7,17 @@ ignores unknown fields, and records every message whole. Only this module deals 
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
+
+import numpy as np
 
 from hippodrome.trial.core import messages
 from hippodrome.trial.core.messages import BadMessage, Message
+from hippodrome.trial.pictures import frames
 
 FIELDS_LENGTH = 3500
 """The most characters of JSON in the unknown fields of one message. If there are more, the fields are not recorded."""
@@ -88,3 +93,20 @@ def _too_deep(value: Any) -> bool:
         nested = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]
         level = [inner for each in nested for inner in each]
     return bool(level)
+
+
+_SIZE = 600, 400  # pixels; HIPPO's page shows frames in about this shape
+_LETTER = 26  # pixels
+_COLUMNS = 38  # letters in a line
+
+
+@lru_cache(maxsize=8)
+def frame_message(words: str) -> str:
+    """Build a message with a frame that shows the words, in the form for clients without a subprotocol."""
+    from PIL import Image, ImageDraw, ImageFont  # noqa: PLC0415 - only for such clients
+
+    picture = Image.new("RGB", _SIZE, "white")
+    text = "\n".join(textwrap.wrap(words, _COLUMNS))
+    font = ImageFont.load_default(_LETTER)
+    ImageDraw.Draw(picture).multiline_text((_SIZE[0] / 2, _SIZE[1] / 2), text, "black", font, "mm", spacing=10)
+    return frames.jpeg_message(np.asarray(picture), 1)

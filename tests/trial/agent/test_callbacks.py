@@ -13,9 +13,9 @@ import pytest
 from hippodrome.protocol import exits
 from hippodrome.trial.agent import callbacks as callbacks_module
 from hippodrome.trial.agent.agent import AgentAdapter
-from hippodrome.trial.agent.callback_names import NAMES
 from hippodrome.trial.agent.callbacks import MAX_VALUES, Callbacks, Session, TrialFacts, listening
-from hippodrome.trial.agent.starting import start
+from hippodrome.trial.agent.joint import start
+from hippodrome.trial.agent.signatures import NAMES
 from hippodrome.trial.recordings import recording
 from testing.waiting import until
 from tests.trial.client_messages import play_to_the_end

@@ -10,7 +10,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from hippodrome.protocol.server_modules import SERVER_MODULES
-from hippodrome.trial.agent.import_path import with_folders
+from hippodrome.trial.agent.loading import with_folders
 
 ROOT = Path(__file__).resolve().parents[3]
 CLONE, LIBRARY = str(ROOT), sysconfig.get_path("stdlib")

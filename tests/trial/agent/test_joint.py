@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hippodrome.trial.agent.agent import AgentAdapter, AgentError
-from hippodrome.trial.agent.joint import Joint, JointAdapter
+from hippodrome.trial.agent.agent import AgentAdapter
+from hippodrome.trial.agent.joint import Joint, JointAdapter, start
 from hippodrome.trial.agent.joint_calls import snapshot
-from hippodrome.trial.agent.starting import start
+from hippodrome.trial.agent.loading import AgentError
 
 PONG = "pettingzoo.butterfly.cooperative_pong_v6"
 TICTACTOE = "pettingzoo.classic.tictactoe_v3"

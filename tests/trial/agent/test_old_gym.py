@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from hippodrome.trial.agent.agent import AgentAdapter
-from hippodrome.trial.agent.starting import start
+from hippodrome.trial.agent.joint import start
 
 OLD_GYM = Path(__file__).parents[3] / "hippodrome/trial/agent/old_gym"
 

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from hippodrome.trial.agent import signatures
-from hippodrome.trial.agent.agent import AgentAdapter, AgentError, read_step_result
+from hippodrome.trial.agent.agent import AgentAdapter, read_step_result
 from hippodrome.trial.agent.calls import AgentCalls
-from hippodrome.trial.agent.starting import start
+from hippodrome.trial.agent.joint import start
+from hippodrome.trial.agent.loading import AgentError
 from hippodrome.trial.core.effects import StepCall
 from hippodrome.trial.core.players import PLAYER, Action
 from hippodrome.trial.recordings import recording

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hippodrome.trial.agent.talk_game import TalkGame
+from hippodrome.trial.agent.loading import TalkGame
 
 
 @pytest.mark.parametrize("reward", [20, {"player_0": 20}])

@@ -36,10 +36,7 @@ ROOT = Path(__file__).parents[3]
 
 CORE = [
     *sorted((ROOT / "hippodrome/trial/core").glob("*.py")),
-    *(
-        ROOT / f"hippodrome/trial/{name}.py"
-        for name in ("pictures/encoder", "pictures/frames", "server/watchdog", "wire/inbound")
-    ),
+    *(ROOT / f"hippodrome/trial/{name}.py" for name in ("pictures/encoder", "pictures/frames", "wire/inbound")),
 ]
 
 

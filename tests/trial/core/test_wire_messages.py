@@ -14,7 +14,7 @@ from PIL import Image
 from hippodrome.trial.core import clients, messages
 from hippodrome.trial.core.controls import Controls
 from hippodrome.trial.pictures import frames
-from hippodrome.trial.server.watchdog import Watchdog
+from hippodrome.trial.server.lifetime import Watchdog
 from hippodrome.trial.settings import trial_section
 
 # ---- what a client says

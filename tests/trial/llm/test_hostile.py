@@ -14,7 +14,7 @@ import pytest
 from hippodrome.local import fake_model
 from hippodrome.local.fake_model import FakeModel
 from hippodrome.trial.llm import client
-from hippodrome.trial.llm.errors import ModelError, ModelRefused, ModelUnavailable
+from hippodrome.trial.llm.client import ModelError, ModelRefused, ModelUnavailable
 from tests.trial.llm.conftest import KEY, World, chat
 
 Worlds = Callable[..., World]

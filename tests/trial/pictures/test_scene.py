@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hippodrome.trial.pictures.frames import FrameError
-from hippodrome.trial.pictures.picture import as_picture
+from hippodrome.trial.pictures.reader import as_picture
 from hippodrome.trial.pictures.scene import MAX_OBJECTS, MAX_TEXT_IN_ALL, Scene, SceneError, as_scene, images_of
 from hippodrome.trial.pictures.scene_object import MAX_POINTS
 

@@ -9,8 +9,7 @@ import pytest
 
 from hippodrome.protocol.trial_sections import SceneSection
 from hippodrome.trial.agent.agent import AgentAdapter
-from hippodrome.trial.agent.joint import JointAdapter
-from hippodrome.trial.agent.starting import start
+from hippodrome.trial.agent.joint import JointAdapter, start
 from hippodrome.trial.pictures.reader import PictureReader
 from hippodrome.trial.pictures.scene import Scene
 

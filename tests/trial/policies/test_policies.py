@@ -20,9 +20,8 @@ from onnx import TensorProto, helper, save
 from hippodrome.protocol.players import ONNXRUNTIME
 from hippodrome.trial.core.players import policy_seed
 from hippodrome.trial.core.policies import Observed
-from hippodrome.trial.policies.load import load
+from hippodrome.trial.policies.places import PolicyThread, load
 from hippodrome.trial.policies.policy import PolicyError
-from hippodrome.trial.policies.thread import PolicyThread
 from testing import onnx_files
 from testing.waiting import PATIENCE, until_async
 

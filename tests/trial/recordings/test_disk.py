@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from hippodrome.protocol import disk
 from hippodrome.trial.recordings import recording
+from hippodrome.trial.recordings.recorder import Spool
 from hippodrome.trial.recordings.recording import Recording, line
-from hippodrome.trial.recordings.spool import Spool
 from hippodrome.trial.recordings.store import FolderStore
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -3,7 +3,7 @@
 import io
 import logging
 
-from hippodrome.trial.server.private_log import IdFilter
+from hippodrome.trial.agent.tracebacks import IdFilter
 
 
 def test_the_traceback_of_an_error_is_logged_without_participants_ids():

@@ -2,7 +2,7 @@
 
 import math
 
-from hippodrome.trial.server.watchdog import Watchdog
+from hippodrome.trial.server.lifetime import Watchdog
 
 
 def test_the_watchdog_ends_a_server_by_idle_time_grace_or_deadline():

@@ -8,7 +8,7 @@ from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.frames import Opcode
 
-from hippodrome.trial.wire import round_trips
+from hippodrome.trial.wire import connection
 from testing.waiting import until_async
 from tests.trial.far_away import far_away
 
@@ -31,7 +31,9 @@ async def measured_connection(samples, *, delay=None):
 
     async def handle(websocket):
         ends.append(websocket)
-        await round_trips.measure(websocket, samples, lambda seconds: reports.append((time.monotonic(), seconds)))
+        await connection.measure_round_trips(
+            websocket, samples, lambda seconds: reports.append((time.monotonic(), seconds))
+        )
 
     async with (
         serve(handle, "127.0.0.1", 0, create_connection=Pinged, compression=None, ping_interval=None) as server,
@@ -52,7 +54,7 @@ async def test_a_round_trip_is_the_time_there_and_back():
 
 
 async def test_the_samples_are_taken_at_once_and_later_ones_now_and_then(monkeypatch):
-    monkeypatch.setattr(round_trips, "EVERY_SECONDS", 3.0)
+    monkeypatch.setattr(connection, "PING_SECONDS", 3.0)
     async with measured_connection(4) as (_, end, reports):
         await until_async(lambda: len(reports) == 5)
         assert end.most == 1
@@ -62,8 +64,8 @@ async def test_the_samples_are_taken_at_once_and_later_ones_now_and_then(monkeyp
 
 
 async def test_a_client_that_does_not_answer_is_reported_as_slow_and_gets_no_further_ping_meanwhile(monkeypatch):
-    monkeypatch.setattr(round_trips, "MAX_SECONDS", 0.3)
-    monkeypatch.setattr(round_trips, "EVERY_SECONDS", 0.1)
+    monkeypatch.setattr(connection, "MAX_ROUND_TRIP", 0.3)
+    monkeypatch.setattr(connection, "PING_SECONDS", 0.1)
     async with measured_connection(1) as (client, end, reports):
         await until_async(lambda: len(reports) >= 1)
         client.transport.pause_reading()
@@ -78,7 +80,7 @@ async def test_a_client_that_does_not_answer_is_reported_as_slow_and_gets_no_fur
 
 async def test_a_pong_that_answers_no_ping_is_not_counted(monkeypatch):
     """A client that sends pongs ahead does not know the four bytes of the ping that they must repeat."""
-    monkeypatch.setattr(round_trips, "EVERY_SECONDS", 0.3)
+    monkeypatch.setattr(connection, "PING_SECONDS", 0.3)
     async with measured_connection(1, delay=0.1) as (client, _, reports):
         for _ in range(200):
             await client.pong(b"1234")
@@ -98,11 +100,11 @@ async def test_measuring_ends_with_the_connection(answers):
 
 
 def test_the_seconds_of_pings_are_those_of_the_documents():
-    assert (round_trips.MAX_SECONDS, round_trips.EVERY_SECONDS) == (10, 5)
+    assert (connection.MAX_ROUND_TRIP, connection.PING_SECONDS) == (10, 5)
 
 
 def test_a_ping_costs_sixteen_bytes():
-    """As round_trips.py says: a ping with 4 bytes of its own, and its pong, which a client masks."""
+    """As connection.py says: a ping with 4 bytes of its own, and its pong, which a client masks."""
     from websockets.frames import Frame
 
     ping, pong = (Frame(opcode, b"1234") for opcode in (Opcode.PING, Opcode.PONG))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hippodrome.trial.wire.reconnects import SECONDS_EACH, Reconnects
+from hippodrome.trial.server.admission import SECONDS_EACH, Reconnects
 
 
 @pytest.mark.parametrize("every", [2, 5, 11])
