@@ -112,7 +112,7 @@ async def _try(file: Path, report: Path, seconds: float) -> None:
 
 def _play(folder: Path, section: Mapping[str, Any]) -> None:
     from hippodrome.trial.agent.agent import AgentAdapter  # noqa: PLC0415 - the process that only reads the report needs no agent
-    from hippodrome.trial.agent.starting import start  # noqa: PLC0415
+    from hippodrome.trial.agent.joint import start  # noqa: PLC0415
     from hippodrome.trial.llm.endpoint import Endpoint  # noqa: PLC0415
     from hippodrome.trial.pictures import assets  # noqa: PLC0415
     from hippodrome.trial.pictures.reader import PictureReader  # noqa: PLC0415

@@ -36,7 +36,7 @@ from hippodrome.control.certificates.rules import (
 from hippodrome.control.ports import Conflict
 from hippodrome.local.backend.documents import FolderDocuments
 from hippodrome.trial.recordings.store import FolderStore
-from hippodrome.trial.server.certificate import Certificate
+from hippodrome.trial.server.listener import Certificate
 from hippodrome.trial.settings import TrialSettings
 from tests.certificate.conftest import DOMAIN, FULLCHAIN, PLACE, PRIVKEY, ROOT_DOMAIN, STATE, Place
 from tests.certificate.pebble import make_ca

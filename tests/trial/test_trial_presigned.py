@@ -18,8 +18,7 @@ from hippodrome.control.model.server import Reason
 from hippodrome.protocol.handover import Handover
 from hippodrome.protocol.keys import handover_key, waiting_key
 from hippodrome.trial.recordings import recording, store
-from hippodrome.trial.recordings.recorder import store_file
-from hippodrome.trial.recordings.store import PresignedStore, StoreError
+from hippodrome.trial.recordings.store import PresignedStore, StoreError, store_file
 from testing.strict_s3 import StrictS3
 from testing.studies import study
 from testing.waiting import until_async

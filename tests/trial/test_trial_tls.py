@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from hippodrome.trial.recordings.store import FolderStore
-from hippodrome.trial.server.certificate import Certificate
+from hippodrome.trial.server.listener import Certificate
 from hippodrome.trial.settings import TrialSettings
 
 

@@ -1,13 +1,17 @@
-"""Finds the players of an environment, one (Gymnasium) or several (PettingZoo and others), and their actions."""
+"""Finds environments, their players, one (Gymnasium) or several (PettingZoo and others), and the players' actions."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import pkgutil
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+_ID = re.compile(r"(?P<name>.+)-v(?P<version>\d+)")
+_OLD_ATARI = re.compile(r"(?P<game>[A-Z]\w*?)(?P<ram>-ram)?(?P<kind>Deterministic|NoFrameskip)?-v(?P<version>[04])")
 
 ACTIONS_UNKNOWN = "list the game's actions as trial.actionSpace in config.yml; the environment does not name them"
 
@@ -65,6 +69,46 @@ def _other_modules(game: str) -> list[str]:
     games = [each.name for each in pkgutil.iter_modules(folder) if re.search(r"_v\d+$", each.name)]
     stem = re.sub(r"_v\d+$", "", name)
     return [other for other in games if other.startswith(f"{stem}_v")] or games
+
+
+def registered_id(env_id: str) -> tuple[str, dict[str, Any]]:
+    """Find the id under which an environment of Gym's is registered now, and further arguments for `gymnasium.make`.
+
+    A version that Gymnasium does not have any more becomes the newest one. An unknown id stays as it is. For the id of
+    an Atari game, ALE's environments are registered first, if ALE is installed.
+    """
+    import gymnasium  # noqa: PLC0415 - a researcher's own agent may need no Gymnasium
+
+    atari = _OLD_ATARI.fullmatch(env_id)
+    if (env_id.startswith("ALE/") or atari) and env_id not in gymnasium.registry:
+        with contextlib.suppress(ImportError):
+            import ale_py  # noqa: PLC0415 - only Atari games need it
+
+            gymnasium.register_envs(ale_py)
+    if env_id in gymnasium.registry:
+        return env_id, {}
+    if atari:
+        frameskip = "NoFrameskip" if atari["kind"] == "NoFrameskip" else ""
+        plain = f"{atari['game']}{frameskip}-v{atari['version']}"
+        if plain in gymnasium.registry:
+            options = {"frameskip": 4} if atari["kind"] == "Deterministic" else {}
+            return plain, options | ({"obs_type": "ram"} if atari["ram"] else {})
+    return _newest(env_id, list(gymnasium.registry)), {}
+
+
+def has_version(env_id: str) -> bool:
+    """Whether the id ends in a version, which every id of Gym does."""
+    return _ID.fullmatch(env_id) is not None
+
+
+def _newest(env_id: str, env_ids: list[str]) -> str:
+    """Return the newest version of the environment among `env_ids`; `env_id` itself if there is no newer one."""
+    wanted_id = _ID.fullmatch(env_id)
+    if wanted_id is None:
+        return env_id
+    same = [match for key in env_ids if (match := _ID.fullmatch(key)) and match["name"] == wanted_id["name"]]
+    newest = max(same, key=lambda match: int(match["version"]), default=wanted_id)
+    return newest[0] if int(newest["version"]) > int(wanted_id["version"]) else env_id
 
 
 def playable(env: Any) -> Any:

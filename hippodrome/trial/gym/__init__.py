@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hippodrome.trial.gym.errors import EnvironmentMalformed, EnvironmentNotFound, InstanceNotFound, WrongAction
+    from hippodrome.trial.gym.forms import EnvironmentMalformed, EnvironmentNotFound, InstanceNotFound, WrongAction
     from hippodrome.trial.gym.overrides import override
     from hippodrome.trial.gym.server import start
 
@@ -23,10 +23,10 @@ __all__ = [
 ]
 
 _LATER = {
-    "EnvironmentMalformed": "errors",
-    "EnvironmentNotFound": "errors",
-    "InstanceNotFound": "errors",
-    "WrongAction": "errors",
+    "EnvironmentMalformed": "forms",
+    "EnvironmentNotFound": "forms",
+    "InstanceNotFound": "forms",
+    "WrongAction": "forms",
     "override": "overrides",
     "start": "server",
 }

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from hippodrome.trial.gym import overrides, values
-from hippodrome.trial.gym.errors import EnvironmentFailed, GymError, WrongAction, WrongParameters, described
+from hippodrome.trial.gym.forms import EnvironmentFailed, GymError, WrongAction, WrongParameters, described
 from hippodrome.trial.gym.recordings import Recorded
 from hippodrome.trial.gym.spaces import CodecError
 

@@ -6,8 +6,8 @@ import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from hippodrome.trial.gym import ids
-from hippodrome.trial.gym.errors import EnvironmentMalformed, EnvironmentNotFound, described
+from hippodrome.trial.agent import environments
+from hippodrome.trial.gym.forms import EnvironmentMalformed, EnvironmentNotFound, described
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -39,7 +39,7 @@ def replaced(func_name: str) -> Callable[..., Any] | None:
 def get_env(env_id: str, seed: int | None = None, **options: Any) -> Any:
     """Make an environment of Gymnasium's registry. `seed` has no effect here: the first reset uses it.
 
-    An id of gym 0.17 that Gymnasium does not have is replaced by the newest one (`ids.py`). An id with a module
+    An id of gym 0.17 that Gymnasium does not have is replaced by the newest one (`registered_id`). An id with a module
     (`module:Name-v0`) is refused, since Gymnasium would import that module. Raises EnvironmentNotFound, and
     EnvironmentMalformed with Gymnasium's reason.
     """
@@ -47,13 +47,13 @@ def get_env(env_id: str, seed: int | None = None, **options: Any) -> Any:
 
     if ":" in env_id:
         raise EnvironmentMalformed(env_id, "a client cannot name a module; the server imports it with --import")
-    now, more = ids.present(env_id)
+    now, more = environments.registered_id(env_id)
     if now != env_id:
         print(f"Gymnasium has no {env_id} any more; {now} is used instead.", file=sys.stderr)
     try:
         return gymnasium.make(now, **(more | options))
     except gymnasium.error.UnregisteredEnv as error:
-        failed = EnvironmentNotFound if ids.has_version(env_id) else EnvironmentMalformed  # as in gym 0.17
+        failed = EnvironmentNotFound if environments.has_version(env_id) else EnvironmentMalformed  # as in gym 0.17
         raise failed(env_id, described(error)) from error
     except Exception as error:
         raise EnvironmentMalformed(env_id, described(error)) from error

@@ -17,7 +17,7 @@ import numpy as np
 
 from hippodrome.protocol.keys import recordings_folder
 from hippodrome.trial.agent import environments
-from hippodrome.trial.gym.errors import EnvironmentFailed
+from hippodrome.trial.gym.forms import EnvironmentFailed
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.recording import Recording
 

@@ -11,19 +11,20 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from hippodrome.trial.gym import exact, overrides, spaces, values
-from hippodrome.trial.gym.errors import (
+from hippodrome.trial.gym import overrides, spaces, values
+from hippodrome.trial.gym.forms import (
+    SUBPROTOCOL,
     EnvironmentFailed,
     GymError,
     InstanceNotFound,
     InvalidMessage,
     LimitReached,
+    MessageForm,
     MethodNotFound,
     WrongParameters,
     described,
     short,
 )
-from hippodrome.trial.gym.forms import SUBPROTOCOL, MessageForm
 from hippodrome.trial.gym.instance import Instance, guarded
 from hippodrome.trial.gym.recordings import ConnectionRecorder
 from hippodrome.trial.gym.spaces import CodecError
@@ -91,7 +92,7 @@ class GymSession:
         if isinstance(message, bytes) and not self.form.exact:
             raise InvalidMessage(f"Binary messages are for the subprotocol {SUBPROTOCOL}.")
         try:
-            request = json.loads(message) if isinstance(message, str) else exact.from_bytes(message)
+            request = json.loads(message) if isinstance(message, str) else values.from_bytes(message)
         except (ValueError, RecursionError):
             raise InvalidMessage(f"Message `{short(str(message[:80]), 80)}` is invalid") from None
         if not isinstance(request, dict):
@@ -101,7 +102,7 @@ class GymSession:
         return request["method"], request["params"]
 
     def _written(self, result: Any) -> str | bytes:
-        return exact.to_bytes(result) if self.form.exact else values.to_text(result)
+        return values.to_bytes(result) if self.form.exact else values.to_text(result)
 
     # ---- the methods that a request may name; their parameters are those of the request, and they return the answer
 

@@ -7,12 +7,11 @@ import contextlib
 import logging
 import tempfile
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from functools import cached_property, partial
-from itertools import count
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from hippodrome.protocol.answer import GAME, Answer, answers_in, to_json
 from hippodrome.protocol.keys import answer_key, with_number
@@ -23,16 +22,14 @@ from hippodrome.trial.core.recorded import RecordedTrial
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.recording import Recording
 from hippodrome.trial.recordings.resume import load_recorded
-from hippodrome.trial.recordings.store import FolderStore, Store, short_error
+from hippodrome.trial.recordings.store import FolderStore, Store, retry_forever, short_error, store_file
 from hippodrome.trial.recordings.tape import Tape
 from hippodrome.trial.settings import TrialSettings
 
-T = TypeVar("T")
 log = logging.getLogger("trial")
 
 FLUSH_SECONDS = 0.5
 """The time within which lines are written to the file: a process that is killed loses at most so much play."""
-_MAX_PAUSE = 20.0  # the longest pause, in seconds
 
 
 class Recorder:
@@ -299,27 +296,3 @@ class Spool:
             else:
                 leftovers.append((f"{prefix}/{path.name.removesuffix('.part')}", path))
         return leftovers
-
-
-async def store_file(store: Store, key: str, path: Path) -> None:
-    """Store a closed recording under its key, or under the key with a number if that exists; then delete the file.
-
-    After an error it tries again, without a limit.
-    """
-    for number in count(1):
-        attempt = partial(asyncio.to_thread, store.create, with_number(key, number), path)
-        if await retry_forever("store a recording", attempt):
-            break
-    path.unlink(missing_ok=True)
-
-
-async def retry_forever(action: str, attempt: Callable[[], Awaitable[T]]) -> T:
-    """Call `attempt` until it succeeds, with growing pauses, and return its result. The log says "cannot `action`"."""
-    pause = 0.5
-    while True:
-        try:
-            return await attempt()
-        except Exception as error:  # noqa: BLE001 - whatever the store raises, the data must not be lost
-            log.warning("cannot %s (%s); trying again in %g s", action, short_error(error), pause)
-        await asyncio.sleep(pause)
-        pause = min(2 * pause, _MAX_PAUSE)

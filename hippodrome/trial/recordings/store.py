@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import filecmp
 import http.client
 import json
+import logging
 import ssl
 import time
-from collections.abc import Callable, Mapping
-from functools import cache
+from collections.abc import Awaitable, Callable, Mapping
+from functools import cache, partial
+from itertools import count
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 from hippodrome.protocol import disk
+from hippodrome.protocol.keys import with_number
+
+T = TypeVar("T")
+log = logging.getLogger("trial")
+
+_MAX_PAUSE = 20.0  # the longest pause between two attempts, in seconds
 
 TIMEOUT = 20.0  # seconds for which a connection may be silent
 PAUSES = (0.3, 1.0, 2.0, 4.0)  # seconds between attempts after a transient error
@@ -63,6 +72,30 @@ def short_error(error: BaseException) -> str:
     """Describe a store's error for the log, without names of files and keys: these contain participants' ids."""
     kind = type(error).__name__
     return f"{kind}: {error.strerror}" if isinstance(error, OSError) else kind
+
+
+async def store_file(store: Store, key: str, path: Path) -> None:
+    """Store a closed recording under its key, or under the key with a number if that exists; then delete the file.
+
+    After an error it tries again, without a limit.
+    """
+    for number in count(1):
+        attempt = partial(asyncio.to_thread, store.create, with_number(key, number), path)
+        if await retry_forever("store a recording", attempt):
+            break
+    path.unlink(missing_ok=True)
+
+
+async def retry_forever(action: str, attempt: Callable[[], Awaitable[T]]) -> T:
+    """Call `attempt` until it succeeds, with growing pauses, and return its result. The log says "cannot `action`"."""
+    pause = 0.5
+    while True:
+        try:
+            return await attempt()
+        except Exception as error:  # noqa: BLE001 - whatever the store raises, the data must not be lost
+            log.warning("cannot %s (%s); trying again in %g s", action, short_error(error), pause)
+        await asyncio.sleep(pause)
+        pause = min(2 * pause, _MAX_PAUSE)
 
 
 class FolderStore:
@@ -148,7 +181,7 @@ class PresignedStore:
     def create(self, key: str, data: bytes | Path) -> bool:
         """Create a document; return False if it exists. Raises OSError.
 
-        Errors are not retried here: the callers do so (`recorder.retry_forever`). S3 may create a document although its
+        Errors are not retried here: the callers do so (`retry_forever`). S3 may create a document although its
         answer is lost, and then refuses the next request for the same key. This call returns True then: a task on
         Fargate runs one process, so no other process creates this server's recordings. A request that is refused (403,
         503) has created nothing: a document that exists all the same is another one.

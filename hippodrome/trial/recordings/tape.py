@@ -19,9 +19,8 @@ from itertools import count
 from typing import Any
 
 from hippodrome.protocol.keys import tape_key
-from hippodrome.trial.recordings.recorder import retry_forever
 from hippodrome.trial.recordings.resume import earlier_servers
-from hippodrome.trial.recordings.store import Store
+from hippodrome.trial.recordings.store import Store, retry_forever
 from hippodrome.trial.settings import TrialSettings
 
 SCHEMA = 1

@@ -35,8 +35,8 @@ from hippodrome.trial.core.players import PlayersError
 from hippodrome.trial.llm.endpoint import Endpoint
 from hippodrome.trial.pictures.reader import Drawing
 from hippodrome.trial.policies.policy import PolicyError
-from hippodrome.trial.recordings.recorder import Spool, store_file
-from hippodrome.trial.recordings.store import Store, open_store, short_error
+from hippodrome.trial.recordings.recorder import Spool
+from hippodrome.trial.recordings.store import Store, open_store, short_error, store_file
 from hippodrome.trial.server import watch
 from hippodrome.trial.server.admission import NOT_ASSIGNED, Admission, first_of
 from hippodrome.trial.server.assignment import AssignmentDocument, Search, set_environment

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from hippodrome.trial.gym import exact, values
+from hippodrome.trial.gym import values
 from hippodrome.trial.gym.spaces import CodecError, build, describe
 from tests.trial.gym.comparing import same
 from tests.trial.gym.remote_environments import EVERYTHING
@@ -47,7 +47,7 @@ def over_json(value: Any) -> Any:
 
 
 def over_bytes(value: Any) -> Any:
-    return exact.from_bytes(exact.to_bytes(value))
+    return values.from_bytes(values.to_bytes(value))
 
 
 @pytest.mark.parametrize("space", SPACES, ids=repr)
@@ -214,7 +214,7 @@ def test_an_action_of_a_message_can_be_written_into() -> None:
 @given(st.binary(max_size=60), st.booleans())
 def test_random_bytes_are_read_or_get_a_sentence(data: bytes, header: bool) -> None:
     try:
-        exact.from_bytes(struct.pack("<I", len(data)) + data if header else data)
+        values.from_bytes(struct.pack("<I", len(data)) + data if header else data)
     except CodecError as error:
         assert str(error).endswith(".")
 
@@ -235,7 +235,7 @@ def test_random_bytes_are_read_or_get_a_sentence(data: bytes, header: bool) -> N
 )
 def test_a_wrong_message_gets_a_sentence(said: str) -> None:
     with pytest.raises(CodecError, match=r"\.$"):
-        exact.from_bytes(struct.pack("<I", len(said)) + said.encode())
+        values.from_bytes(struct.pack("<I", len(said)) + said.encode())
 
 
 # --- infos ---

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from hippodrome.gym import RemoteEnv, RemoteError
-from hippodrome.trial.gym import ids
+from hippodrome.trial.agent.environments import registered_id
 from testing.gym_server import gym_server
 
 
@@ -33,7 +33,7 @@ def url() -> Iterator[str]:
     ],
 )
 def test_an_old_id_makes_its_successor(url: str, old: str, now: str) -> None:
-    assert ids.present(old)[0] == now
+    assert registered_id(old)[0] == now
     with RemoteEnv(url, old) as env:
         env.reset(seed=1)
         env.step(env.action_space.sample())
@@ -49,14 +49,14 @@ def test_an_old_id_makes_its_successor(url: str, old: str, now: str) -> None:
     ],
 )
 def test_an_old_name_of_an_atari_game_becomes_options(old: str, options: dict[str, Any]) -> None:
-    assert ids.present(old)[1] == options
+    assert registered_id(old)[1] == options
 
 
 @pytest.mark.parametrize(
     "env_id", ["CartPole-v7", "CartPole", "Nothing-v0", "NothingDeterministic-v4", "", "-v0", "ALE/"]
 )
 def test_an_unknown_id_stays_as_it_is(env_id: str) -> None:
-    assert ids.present(env_id) == (env_id, {})
+    assert registered_id(env_id) == (env_id, {})
 
 
 def test_a_version_that_does_not_exist_yet_remains_an_error(url: str) -> None:

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from websockets.sync.server import ServerConnection, serve
 
 from hippodrome.gym import ConnectionLost, RemoteEnv, RemoteError
-from hippodrome.trial.gym import exact
+from hippodrome.trial.gym import values
 from hippodrome.trial.gym.forms import SUBPROTOCOL
 from hippodrome.trial.gym.spaces import describe
 
@@ -56,10 +56,10 @@ def test_a_server_of_another_protocol_gets_a_sentence() -> None:
         "a",
         b"",
         b"\x01" * 30,
-        exact.to_bytes([]),
-        exact.to_bytes({}),
-        exact.to_bytes(MADE | {"observation_space": {"name": "Hexagon"}}),
-        exact.to_bytes(MADE | {"metadata": 3}),
+        values.to_bytes([]),
+        values.to_bytes({}),
+        values.to_bytes(MADE | {"observation_space": {"name": "Hexagon"}}),
+        values.to_bytes(MADE | {"metadata": 3}),
     ],
     ids=lambda answer: repr(answer)[:30],
 )
@@ -70,13 +70,13 @@ def test_a_wrong_answer_to_make_ends_the_connection_with_a_sentence(answer: str 
 
 def test_an_error_as_the_answer_to_make() -> None:
     error = {"error": {"type": "LimitReached", "message": "Too many."}}
-    with server_answering(exact.to_bytes(error)) as url, pytest.raises(RemoteError, match=r"^Too many\.$"):
+    with server_answering(values.to_bytes(error)) as url, pytest.raises(RemoteError, match=r"^Too many\.$"):
         RemoteEnv(url, "CartPole-v1")
 
 
-@pytest.mark.parametrize("answer", ["", b"", exact.to_bytes([])[:-1]])
+@pytest.mark.parametrize("answer", ["", b"", values.to_bytes([])[:-1]])
 def test_an_answer_that_cannot_be_read_ends_the_connection_with_a_sentence(answer: str | bytes) -> None:
-    with server_answering(exact.to_bytes(MADE), answer) as url, RemoteEnv(url, "CartPole-v1") as env:
+    with server_answering(values.to_bytes(MADE), answer) as url, RemoteEnv(url, "CartPole-v1") as env:
         with pytest.raises(ConnectionLost, match=r"\.$"):
             env.step(1)
         with pytest.raises(ConnectionLost, match="any more"):

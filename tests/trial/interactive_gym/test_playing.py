@@ -17,8 +17,8 @@ import pytest
 import yaml
 
 from hippodrome.trial.interactive_gym import playing
-from hippodrome.trial.interactive_gym.game import RemoteGame
 from hippodrome.trial.interactive_gym.options import RemoteConfig, Unplayable
+from hippodrome.trial.interactive_gym.playing import RemoteGame
 from tests.trial.client_messages import play_to_the_end
 from tests.trial.interactive_gym.experiments import ALONE, HELPER, PEOPLE, RUN, TOGETHER, run_experiment
 from tests.trial.sessions import SID, answer, form, member, recordings

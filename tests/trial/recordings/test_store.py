@@ -13,8 +13,7 @@ import pytest
 
 from hippodrome.control.model import server
 from hippodrome.protocol import disk
-from hippodrome.trial.recordings.recorder import store_file
-from hippodrome.trial.recordings.store import Store, open_store
+from hippodrome.trial.recordings.store import Store, open_store, store_file
 from testing.strict_s3 import StrictS3
 from testing.studies import study
 

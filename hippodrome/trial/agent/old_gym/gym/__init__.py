@@ -12,11 +12,12 @@ import gymnasium
 from gymnasium import error, spaces
 from gymnasium.spaces import Space
 
-from gym import core, envs, utils, version, wrappers
+from gym import core, envs, utils, wrappers
 from gym.core import ActionWrapper, Env, ObservationWrapper, RewardWrapper, Wrapper
-from gym.envs.registration import make, register
+from gym.envs import make, register
 
 __all__ = [
+    "VERSION",
     "ActionWrapper",
     "Env",
     "ObservationWrapper",
@@ -35,8 +36,12 @@ __all__ = [
     "wrappers",
 ]
 
-__version__ = version.VERSION
+__version__ = VERSION = "0.21.0"  # the last in wide use before `step` returned five values
+version = sys.modules[__name__]
 
-for _name, _module in list(sys.modules.items()):  # so that `from gym.spaces.box import Box` finds Gymnasium's
+# So that `import gym.version`, `from gym.utils.seeding import np_random` or `from gym.spaces.box import Box` find them.
+sys.modules |= {f"{__name__}.version": version}
+sys.modules |= {f"{__name__}.utils.seeding": utils, f"{__name__}.envs.registration": envs}
+for _name, _module in list(sys.modules.items()):
     if _name.startswith(("gymnasium.spaces", "gymnasium.error")):
         sys.modules.setdefault(_name.replace(gymnasium.__name__, __name__, 1), _module)

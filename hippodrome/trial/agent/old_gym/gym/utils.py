@@ -1,6 +1,13 @@
-"""Random numbers, by NumPy's RandomState, as Gym used it."""
+"""Gym's utilities: random numbers by NumPy's RandomState, as Gym used it, and Gymnasium's `EzPickle`."""
+
+import sys
 
 import numpy as np
+from gymnasium.utils import EzPickle
+
+__all__ = ["EzPickle", "np_random", "seeding"]
+
+seeding = sys.modules[__name__]  # `gym.utils.seeding`
 
 
 def np_random(seed: int | None = None) -> tuple[np.random.RandomState, int]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
-import re
+import sys
 import warnings
 from typing import Any
 
@@ -13,11 +12,9 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from gym.core import FromGymnasium
 from gym.wrappers import TimeLimit
+from hippodrome.trial.agent.environments import registered_id
 
-_ID = re.compile(r"(?P<name>.+)-v(?P<version>\d+)")
-_OLD_ATARI = re.compile(r"(?P<game>[A-Z]\w*?)(?P<kind>Deterministic|NoFrameskip)?-v(?P<version>[04])")
-
-
+registration = sys.modules[__name__]  # `gym.envs.registration`
 registry: dict[str, EnvSpec] = {}
 """What `register` was given, by id."""
 
@@ -38,13 +35,15 @@ def make(id: str, **kwargs: Any) -> Any:
         id = rest
     if id in registry:
         return _make_registered(registry[id], kwargs)
-    id, more = _present(id)
+    now, more = registered_id(id)
+    if now != id and not more:
+        warnings.warn(f"Gymnasium has no {id} any more; {now} is used instead", stacklevel=2)
     kwargs = {"disable_env_checker": True, **more, **kwargs}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of Gymnasium, that the id is old
         if "render_mode" in kwargs:
-            return gymnasium.make(id, **kwargs)
-        return FromGymnasium(gymnasium.make(id, render_mode="rgb_array", **kwargs))
+            return gymnasium.make(now, **kwargs)
+        return FromGymnasium(gymnasium.make(now, render_mode="rgb_array", **kwargs))
 
 
 def _make_registered(spec: EnvSpec, kwargs: dict[str, Any]) -> Any:
@@ -52,24 +51,3 @@ def _make_registered(spec: EnvSpec, kwargs: dict[str, Any]) -> Any:
     env = create(**{**spec.kwargs, **kwargs})
     env.unwrapped.spec = spec
     return TimeLimit(env, spec.max_episode_steps) if spec.max_episode_steps else env
-
-
-def _present(id: str) -> tuple[str, dict[str, Any]]:
-    """Return the environment's id in Gymnasium or ALE today, and further arguments for `gymnasium.make`."""
-    atari = _OLD_ATARI.fullmatch(id)
-    if (id.startswith("ALE/") or atari) and id not in gymnasium.registry:
-        with contextlib.suppress(ImportError):
-            import ale_py  # noqa: PLC0415 - needed for Atari games alone
-
-            gymnasium.register_envs(ale_py)
-    if id in gymnasium.registry:
-        return id, {}
-    if atari and (plain := f"{atari['game']}-v{atari['version']}") in gymnasium.registry:
-        return plain, {"frameskip": 4}  # all other kinds are registered
-    known = [match for key in gymnasium.registry if (match := _ID.fullmatch(key))]
-    same = [match for match in known if match["name"] == id.rpartition("-v")[0]]
-    if not same:
-        return id, {}
-    newest = str(max(same, key=lambda match: int(match["version"]))[0])
-    warnings.warn(f"Gymnasium has no {id} any more; {newest} is used instead", stacklevel=3)
-    return newest, {}
