@@ -25,7 +25,7 @@ from hippodrome.trial.core.recorded import RecordedTrial
 from hippodrome.trial.core.trial import Trial
 from hippodrome.trial.policies.places import load_policies
 from hippodrome.trial.recordings.recorder import rules
-from hippodrome.trial.recordings.recording import read_observation, text_of_line
+from hippodrome.trial.recordings.recording import read_observation
 from hippodrome.trial.recordings.resume import add_lines
 from hippodrome.trial.settings import TrialSettings
 
@@ -161,7 +161,7 @@ class Game:
                 self.head = json.loads(json.dumps(rules(self.settings.trial, effect.players)))
                 effects += self.trial.recording_opened(self.now)
             elif isinstance(effect, WriteLine):
-                self.lines.append(json.loads(text_of_line(effect.line)))
+                self.lines.append(json.loads(effect.line))
             elif isinstance(effect, RecordLine):
                 self.lines.append({"kind": effect.kind, **effect.fields})
             elif isinstance(effect, AskPolicy | ResetPolicy):

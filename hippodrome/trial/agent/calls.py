@@ -119,24 +119,14 @@ class Calls:
     def _extra(self, values: Mapping[str, Any]) -> dict[str, Any]:
         return {"extra": self._bounded("what step() returns as %r", values)}
 
-    def _line(self, kind: str, /, **fields: Any) -> recording.Line:
+    def _line(self, kind: str, /, **fields: Any) -> bytes:
         """Build a line of the recording. The size of a value in an `info` replaces the value if it is too large."""
-        if self._is_settled(fields):
-            return recording.LaterLine(kind, fields | {"info": dict(fields["info"])})
         line = None if self._cut else recording.line(kind, **fields)
         if line is not None and len(line) <= recording.MAX_EXTRA_BYTES:
             return line
         cut = self._cut_infos(fields)
         self._cut = bool(cut)  # then the next line's infos are cut first: to write 50 MB as JSON takes seconds
         return line if line is not None and not cut else recording.line(kind, **{**fields, **cut})
-
-    def _is_settled(self, fields: Mapping[str, Any]) -> bool:
-        """Whether all values of a line are small and no later step can change them, as in most games."""
-        if self._record_observations or "extra" in fields:
-            return False
-        parts = fields["players"].values() if "players" in fields else ()
-        infos = (fields["info"], *(part["info"] for part in parts if "info" in part))
-        return all(map(recording.is_settled, infos))
 
     def _cut_infos(self, fields: Mapping[str, Any]) -> dict[str, Any]:
         """Return the fields of a line whose infos are too large, with the sizes of their large values instead."""

@@ -135,7 +135,7 @@ class Recorder:
         """Build a line of this kind, with the fields of `stamp`."""
         return recording.line(kind, **self.stamp(), **fields)
 
-    def write(self, line: recording.Line) -> None:
+    def write(self, line: bytes) -> None:
         """Write a line. It is in the file within `FLUSH_SECONDS`. Without an open recording it is dropped."""
         if self._recording is None:
             return

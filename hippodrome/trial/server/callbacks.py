@@ -14,7 +14,6 @@ from typing import Any
 from hippodrome.trial.agent.callbacks import Callbacks
 from hippodrome.trial.agent.worker import Worker
 from hippodrome.trial.core.effects import TellAgent
-from hippodrome.trial.recordings.recording import Line
 
 _EVENTS = 4  # if so many events wait, a return removes the leave that still waits before it
 
@@ -26,7 +25,7 @@ class TrialCallbacks:
         self,
         worker: Worker,
         limit: float,
-        write: Callable[[Line], None],
+        write: Callable[[bytes], None],
         *,
         is_open: Callable[[], bool],
         is_over: Callable[[], bool],

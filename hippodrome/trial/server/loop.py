@@ -59,7 +59,6 @@ from hippodrome.trial.llm.partner import NoPrompt, Partner, prompt_of
 from hippodrome.trial.policies.places import Places
 from hippodrome.trial.policies.policy import PolicyError
 from hippodrome.trial.recordings.recorder import Recorder, Spool
-from hippodrome.trial.recordings.recording import Line
 from hippodrome.trial.recordings.store import Store, short_error
 from hippodrome.trial.server.callbacks import TrialCallbacks
 from hippodrome.trial.server.earlier_answers import read_earlier
@@ -496,7 +495,7 @@ class TrialLoop:
         connection: Any = effect.connection
         connection.close_done(effect.episodes, effect.score, effect.outcome, effect.words)
 
-    def _write(self, line: Line) -> None:
+    def _write(self, line: bytes) -> None:
         self._recorder.write(line)
         self._watchers.tell(line)
 

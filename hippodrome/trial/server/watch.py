@@ -16,7 +16,6 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from hippodrome.trial.core.messages import CloseConnection, CommandRefused
-from hippodrome.trial.recordings.recording import Line, text_of_line
 from hippodrome.trial.wire.inbound import MESSAGES_A_SECOND, RateLimit
 
 PATH = "/gym"
@@ -35,13 +34,12 @@ class Watchers:
     def __init__(self) -> None:
         self._waiting: dict[Lines, Callable[[], None]] = {}
 
-    def tell(self, line: Line) -> None:
+    def tell(self, line: bytes) -> None:
         """Pass on a line without waiting: the connection of a program that does not read its lines is cut."""
         if not self._waiting:
             return
-        text = text_of_line(line)
         for lines, cut_off in [*self._waiting.items()]:
-            if not lines.put(text):
+            if not lines.put(line):
                 del self._waiting[lines]
                 cut_off()
 

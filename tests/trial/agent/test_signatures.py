@@ -20,7 +20,6 @@ from hippodrome.trial.agent.loading import AgentError
 from hippodrome.trial.core.effects import StepCall
 from hippodrome.trial.core.players import PLAYER, Action
 from hippodrome.trial.recordings import recording
-from hippodrome.trial.recordings.recording import text_of_line
 
 AGENT = """
 import numpy
@@ -339,7 +338,7 @@ def line_of(folder: Path, returned: str, more: str = "") -> dict[str, Any]:
     step = StepCall(
         limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={"episode": 1, "step": 1}
     )
-    return json.loads(text_of_line(calls.run(step).line))
+    return json.loads(calls.run(step).line)
 
 
 def test_the_dict_of_a_step_is_recorded_whole(tmp_path: Path) -> None:
@@ -368,7 +367,7 @@ def test_an_entry_that_is_too_large_is_logged_once_and_the_others_are_recorded(
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     with caplog.at_level(logging.WARNING, "trial"):
-        lines = [json.loads(text_of_line(calls.run(step).line)) for _ in range(3)]
+        lines = [json.loads(calls.run(step).line) for _ in range(3)]
     assert [line["extra"] for line in lines] == [{"small": 1, "large": {"tooLarge": 2_000_002}, "last": 2}] * 3
     assert [record.getMessage() for record in caplog.records] == [
         "what step() returns as 'large' is too large for the recording (2000002 bytes); its size is recorded instead"
@@ -383,7 +382,7 @@ def test_an_info_that_is_too_large_is_logged_once_and_the_rest_of_it_is_recorded
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     with caplog.at_level(logging.WARNING, "trial"):
-        lines = [json.loads(text_of_line(calls.run(call).line)) for call in (step, step)]
+        lines = [json.loads(calls.run(call).line) for call in (step, step)]
     assert [line["info"] for line in lines] == [{"small": 1, "large": {"tooLarge": 2_000_002}, "last": [2]}] * 2
     assert [record.getMessage() for record in caplog.records] == [
         "'large' in info is too large for the recording (2000002 bytes); its size is recorded instead"
@@ -396,7 +395,7 @@ def test_an_info_of_too_many_values_is_cut_off_with_a_mark(tmp_path: Path, caplo
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     with caplog.at_level(logging.WARNING, "trial"):
-        lines = [text_of_line(calls.run(call).line) for call in (step, step)]
+        lines = [calls.run(call).line for call in (step, step)]
     assert max(map(len, lines)) < 1.2 * recording.MAX_EXTRA_BYTES
     kept = json.loads(lines[1])["info"]
     assert json.loads(lines[0])["info"] == kept
@@ -410,7 +409,7 @@ def test_thirty_infos_of_fifty_megabytes_are_written_within_the_tests_time(tmp_p
     player = started_agent(tmp_path, "return 0, 1.0, False, {}", f"return 0, 1.0, False, False, {info}")
     calls = AgentCalls(player, dict, record_observations=False)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
-    first, *others = [json.loads(text_of_line(calls.run(step).line))["info"] for _ in range(30)]
+    first, *others = [json.loads(calls.run(step).line)["info"] for _ in range(30)]
     assert first["text"] == {"tooLarge": 50_000_002}
     assert first["array"].keys() == {"tooLarge"}
     assert first["last"] == 1
@@ -429,7 +428,7 @@ for _ in range(25): deep = [deep]
     )
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
     calls = AgentCalls(player, dict, record_observations=False)
-    _, after, later = [json.loads(text_of_line(calls.run(step).line))["info"] for _ in range(3)]
+    _, after, later = [json.loads(calls.run(step).line)["info"] for _ in range(3)]
     assert after == later
     assert later["on"] == {"true": [1]}
 
@@ -439,7 +438,7 @@ def test_an_info_is_recorded_whole_beside_a_large_observation(tmp_path: Path) ->
     player = started_agent(tmp_path, "return 0, 1.0, False, {}", f"return {observation}, 1.0, False, False, {info}")
     calls = AgentCalls(player, dict, record_observations=True)
     step = StepCall(limit=1, actions={PLAYER: Action(1, "left", "human")}, feedback=(), messages=0, fields={})
-    line = json.loads(text_of_line(calls.run(step).line))
+    line = json.loads(calls.run(step).line)
     assert line["info"] == {"many": list(range(200))}
     assert len(line["observation"]) == 6_000_000
 
@@ -453,7 +452,7 @@ def test_an_info_that_the_game_changes_afterwards_stays_as_it_was(tmp_path: Path
     lines = [calls.run(step).line for _ in range(3)]
     expected: dict[str, Any] = {"game.steps": [1, 2, 3], "[game.steps]": [[1], [2], [3]]}
     expected |= {"{'x': (game.steps,)}": [{"x": [1]}, {"x": [2]}, {"x": [3]}], "numpy.int64(game.steps)": [1, 2, 3]}
-    assert [json.loads(text_of_line(line))["info"]["lives"] for line in lines] == expected[value]
+    assert [json.loads(line)["info"]["lives"] for line in lines] == expected[value]
 
 
 def test_a_dict_that_contains_itself_is_recorded(tmp_path: Path) -> None:

@@ -431,35 +431,6 @@ def test_the_time_of_a_line_is_written_in_utc():
     assert recording.line("step", time="now") == b'{"kind":"step","time":"now"}\n'
 
 
-SETTLED = [
-    {},
-    {"lives": 3, "level": 0.5, "over": False, "who": None, "name": "x" * 1_000},
-    {2**63: -(2**63)},
-    dict.fromkeys(range(100)),
-]
-UNSETTLED = [
-    {"a": []},
-    {"a": {}},
-    {"a": np.float32(1)},
-    {"a": "x" * 1_001},
-    {"x" * 1_001: 1},
-    {"a": 2**63 + 1},
-    {"a": -(2**63) - 1},
-    {(1, 2): 1},
-    dict.fromkeys(range(101)),
-    UserDict(a=1),
-]
-
-
-def test_the_text_of_a_line_with_few_small_values_is_made_when_it_is_written():
-    assert all(recording.is_settled(info) for info in SETTLED)
-    assert not any(recording.is_settled(info) for info in UNSETTLED)
-    for info in SETTLED:
-        fields = {"step": 1, "info": info, "reward": float("nan")}
-        line = recording.line("step", **fields)
-        assert recording.text_of_line(recording.LaterLine("step", fields)) == recording.text_of_line(line) == line
-
-
 def test_an_info_may_have_a_million_bytes_of_json():
     room = 1_000_000 - len('{"a":""}')
     assert not recording.is_too_large({"a": "x" * room})
