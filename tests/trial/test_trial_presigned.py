@@ -17,7 +17,8 @@ from hippodrome.control.model import ids, server
 from hippodrome.control.model.server import Reason
 from hippodrome.protocol.handover import Handover
 from hippodrome.protocol.keys import handover_key, waiting_key
-from hippodrome.trial.recordings import recording, store
+from hippodrome.trial.recordings import recording
+from hippodrome.trial.recordings import store as stores
 from hippodrome.trial.recordings.store import PresignedStore, StoreError, store_file
 from testing.strict_s3 import StrictS3
 from testing.studies import study
@@ -233,7 +234,7 @@ async def test_a_recording_is_stored_once_if_the_answer_to_its_request_is_lost(t
     record, path, losses = town.start(), tmp_path / "recording", iter([True])
     key = f"{FOLDER}/trials/{record.name}/3-trial.jsonl.gz"
     path.write_bytes(b"the recording")
-    send = store._send
+    send = stores._send
 
     def send_and_lose_the_first_put(request, *more):
         reply = send(request, *more)
@@ -241,7 +242,7 @@ async def test_a_recording_is_stored_once_if_the_answer_to_its_request_is_lost(t
             raise StoreError("no answer: TimeoutError")
         return reply
 
-    monkeypatch.setattr(store, "_send", send_and_lose_the_first_put)
+    monkeypatch.setattr(stores, "_send", send_and_lose_the_first_put)
     await store_file(town.store(record), key, path)
     assert [each for each in town.documents.kept if each.startswith(FOLDER)] == [key]
     assert not path.exists()
@@ -279,7 +280,7 @@ def test_a_refusal_that_comes_before_the_body_is_sent_is_read(tmp_path):
         url = f"http://127.0.0.1:{listening.getsockname()[1]}/bucket/key"
         with path.open("rb") as body:
             request = {"method": "PUT", "url": url, "headers": {"Content-Length": "20000000"}}
-            assert store._send(request, body) == (412, b"")
+            assert stores._send(request, body) == (412, b"")
         thread.join()
 
 
@@ -299,7 +300,7 @@ def test_reading_gives_up_after_some_time_and_says_so_without_names(town):
     town.failing = [500] * 50
     with pytest.raises(StoreError) as error:
         store.get(ANSWER)
-    assert len(town.failing) == 50 - len(store.PAUSES) - 1
+    assert len(town.failing) == 50 - len(stores.PAUSES) - 1
     assert error.value.strerror == "the answer was HTTP 500"
 
 
@@ -309,7 +310,7 @@ def test_a_request_that_has_expired_is_refused_and_a_new_one_is_taken(town, monk
     store.create(ANSWER, b"{}")
     old = town.signer.presign_get(ANSWER, 1)
     time.sleep(1.1)
-    assert store._send({"method": "GET", "url": old.url, "headers": {}}, None)[0] == 403
+    assert stores._send({"method": "GET", "url": old.url, "headers": {}}, None)[0] == 403
     assert store.get(ANSWER) == b"{}"
 
 
