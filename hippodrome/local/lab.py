@@ -25,9 +25,8 @@ from hippodrome.control.model import ids
 from hippodrome.control.model.project import Project
 from hippodrome.control.participants import forms, frame
 from hippodrome.control.participants.frame import Html
-from hippodrome.control.ports import Platform
-from hippodrome.control.storage.project_cache import ProjectCache
 from hippodrome.control.storage.secret import SecretCache
+from hippodrome.local.backend.platform import LocalPlatform
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - a lab's server is there for other machines
 _NOBODY = "/join"  # no participant's id, so that a key of `/join` signs nobody's link
@@ -85,7 +84,7 @@ def _addresses() -> list[str]:
 class Lab:
     """The links and pages of a lab's server. `url` is its address."""
 
-    def __init__(self, platform: Platform, url: str, project_ids: Callable[[], Sequence[str]]) -> None:
+    def __init__(self, platform: LocalPlatform, url: str, project_ids: Callable[[], Sequence[str]]) -> None:
         self._platform = platform
         self._url = url
         self._project_ids = project_ids
@@ -97,7 +96,7 @@ class Lab:
 
     def link(self, project_id: str) -> str:
         """Return the address that makes a new participant of the study for each browser that opens it."""
-        project = self._project(project_id)
+        project = self._platform.project(project_id)
         return f"{self._url}/join/{project_id}?{urlencode({'key': _join_key(project) if project else ''})}"
 
     def functions(self, of_study: Mapping[str, Handler]) -> dict[str, Handler]:
@@ -119,7 +118,7 @@ class Lab:
     def _join(self, event: dict[str, Any], _context: object) -> dict[str, Any]:
         """Answer `/join/{projectId}`: lead to the signed link of a new participant, with the link's other fields."""
         request, named = Request.from_event(event), str(event["pathParameters"]["projectId"])
-        project = self._project(named) if named in self._project_ids() else None
+        project = self._platform.project(named) if named in self._project_ids() else None
         if project is None or not _same(request.query_value("key"), _join_key(project)):
             return _refused(403, "This link is not whole. Please ask for it again.")
         user_id = secrets.token_hex(12)
@@ -132,7 +131,7 @@ class Lab:
         """Answer `/lab`: the list of the studies, for whoever holds its key."""
         if not _same(Request.from_event(event).query_value("key"), self._list_key):
             return _refused(403, "The list needs its key: open the link that the server has printed.")
-        rows = [self._row(project) for name in self._project_ids() if (project := self._project(name))]
+        rows = [self._row(project) for name in self._project_ids() if (project := self._platform.project(name))]
         text = "Each browser that opens a study's link is a new participant. Scan the code, or copy the address."
         page = frame.message_page("Studies", text, more=Html("\n".join(rows)))
         return http.html(200, page.html, page.headers).to_event()
@@ -148,9 +147,6 @@ class Lab:
     @property
     def _list_key(self) -> str:
         return SecretCache(self._platform.documents).get_or_create().derive("lab")[:32]
-
-    def _project(self, project_id: str) -> Project | None:
-        return ProjectCache(self._platform, SecretCache(self._platform.documents)).project(project_id)
 
 
 def _projects_of(event: Mapping[str, Any]) -> set[str]:

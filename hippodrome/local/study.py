@@ -15,9 +15,6 @@ from rich.text import Text
 from hippodrome.console.problem import Problem
 from hippodrome.control.config import Config
 from hippodrome.control.model import ids
-from hippodrome.control.model.project import Project
-from hippodrome.control.storage.project_cache import ProjectCache
-from hippodrome.control.storage.secret import SecretCache
 from hippodrome.functions import installed, next_step, send_start_server_message, send_stop_server_message
 from hippodrome.local import own_cells, own_places
 from hippodrome.local.activity.log import ActivityLog
@@ -263,7 +260,7 @@ class Study:
 
     def _how_to_try_cells(self, config: Config) -> list[Text]:
         """With `conditions`: a link for each of the first cells; with `players` one for each place."""
-        project, link = self._published_project(config), self._link(config)
+        project, link = self._platform.project(config.project.id), self._link(config)
         names = own_cells.cell_names(project) if project else []
         if not names or project is None:
             return []
@@ -287,14 +284,10 @@ class Study:
             return self._place_queries(config)
         return [self._signed(config, _new_id()) if config.project.signed_links else ""]
 
-    def _published_project(self, config: Config) -> Project | None:
-        cache = ProjectCache(self._platform, SecretCache(self._platform.documents))
-        return cache.project(config.project.id)
-
     def _signed(self, config: Config, user_id: str) -> str:
         """What is appended to the study's link to make this participant's signed link."""
         project_id = config.project.id
-        project = self._published_project(config)
+        project = self._platform.project(config.project.id)
         signature = ids.link_signature(project.secret if project else "", project_id, user_id)
         return f"&userId={user_id}&signature={signature}"
 

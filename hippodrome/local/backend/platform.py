@@ -18,14 +18,15 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from hippodrome.control.config import Config
-from hippodrome.control.model.project import MASTER_LIST
+from hippodrome.control.model.project import MASTER_LIST, Project
 from hippodrome.control.model.records import from_json
 from hippodrome.control.model.server import RECORDS, Server
 from hippodrome.control.ports import Conflict, Document, Settings, Topic
-from hippodrome.control.storage.secret import KEY
+from hippodrome.control.storage.project_cache import ProjectCache
+from hippodrome.control.storage.secret import KEY, SecretCache
 from hippodrome.functions import installed, start_server, stop_server, sweep, task_changed
 from hippodrome.local.backend import files
 from hippodrome.local.backend.bus import Handler, LocalBus
@@ -129,6 +130,10 @@ class LocalPlatform:
             config.project.id, folder, has_model=bool(config.models), keeps_recordings=config.trial.s3upload
         )
         return config
+
+    def project(self, project_id: str) -> Project | None:
+        """Return the registered project; None if there is none."""
+        return ProjectCache(self, SecretCache(self.documents)).project(project_id)
 
     def port_of(self, name: str) -> int | None:
         """Return the port of the server with this DNS name; None if there is no such server."""
@@ -236,7 +241,7 @@ class LocalPlatform:
         while handler and not self._closed.wait(wait):
             wait = SWEEP_EVERY
             try:
-                handler(_scheduled(self.now()), None)
+                handler({}, None)
             except Exception as error:  # noqa: BLE001 - the next sweep tries again
                 self._say(f"the sweep failed: {type(error).__name__}: {error}")
 
@@ -246,18 +251,3 @@ def _game_sources(lab: str | None, named_port: int | None) -> str:
     if lab is not None:
         return lab.replace("http", "ws", 1)
     return f"wss://*.{DOMAIN}:{named_port}" if named_port else "ws://127.0.0.1:*"
-
-
-def _scheduled(now: datetime) -> dict[str, Any]:
-    """The event of an EventBridge schedule."""
-    return {
-        "version": "0",
-        "id": "local",
-        "detail-type": "Scheduled Event",
-        "source": "aws.events",
-        "account": "000000000000",
-        "time": now.strftime("%Y-%m-%dT%H:%M:%SZ"),
-        "region": "local",
-        "resources": [],
-        "detail": {},
-    }

@@ -9,15 +9,12 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import secrets
 import shlex
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from random import Random
 from typing import Annotated
 
 import typer
@@ -25,8 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from hippodrome.bots.addresses import THIS_MACHINE, AddressRefused
-from hippodrome.bots.bot import Bot
-from hippodrome.bots.crowd import SIGNALS, interruptible, walk
+from hippodrome.bots.crowd import SIGNALS, interruptible
 from hippodrome.bots.links import with_project
 from hippodrome.bots.report import BotReport
 from hippodrome.console.arguments import StudyFolder
@@ -36,9 +32,8 @@ from hippodrome.control.config import Config, ConfigErrors, read_project
 from hippodrome.control.config.folder import read_source
 from hippodrome.local import requirements
 from hippodrome.local.rehearsal import ends as reached
-from hippodrome.local.rehearsal.crashes import ServerLogs
-from hippodrome.local.rehearsal.ends import Ends
-from hippodrome.local.rehearsal.logs import FunctionLog, verify
+from hippodrome.local.rehearsal.ends import Crowd, Ends
+from hippodrome.local.rehearsal.logs import StudyLogs, verify
 from hippodrome.local.rehearsal.report import report
 from hippodrome.local.rehearsal.study_process import (
     TRIED,
@@ -51,50 +46,6 @@ from hippodrome.local.rehearsal.study_process import (
     wait_until_gone,
 )
 from hippodrome.local.study_folder import must_hold_study
-
-
-@dataclass(frozen=True)
-class Crowd:
-    """How many bots walk through the study, and how. `at_once` is how many walk at one time; times are in seconds."""
-
-    bots: int
-    _: KW_ONLY
-    play: float
-    at_once: int
-    patience: float
-    ramp: float
-    right: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # the right answers of checks, by step
-
-
-async def rehearse(link: str, crowd: Crowd, watch: Callable[[Sequence[BotReport]], None]) -> list[BotReport]:
-    """Send the crowd through the study, and return the bots' reports. If this is cancelled, all bots end."""
-    run, width = secrets.token_hex(3), len(str(crowd.bots))
-    bots = [
-        Bot(
-            link,
-            f"bot-{run}-{number:0{width}}",
-            Random(f"{run}{number}"),  # noqa: S311 - bots
-            play=crowd.play,
-            patience=crowd.patience,
-            right=crowd.right,
-        )
-        for number in range(1, crowd.bots + 1)
-    ]
-    return await walk(bots, at_once=crowd.at_once, ramp=crowd.ramp, watch=watch)
-
-
-async def _to_ends(
-    ends: Ends, link: str, crowd: Crowd, watch: Callable[[Sequence[BotReport]], None]
-) -> list[BotReport]:
-    return await ends.rehearse(
-        link,
-        watch,
-        at_once=crowd.at_once,
-        ramp=crowd.ramp,
-        play=crowd.play,
-        patience=crowd.patience,
-        right=crowd.right,
-    )
 
 
 @contextlib.contextmanager
@@ -183,6 +134,7 @@ def _rehearse_and_report(
     folder: Path,
     config: Config,
     crowd: Crowd,
+    bots: int,
     *,
     link: str,
     data: Path | None,
@@ -191,15 +143,13 @@ def _rehearse_and_report(
     began: float,
     ends: Ends | None = None,
 ) -> bool:
-    """Send the crowd through the study at `link`, and print the report; return whether all is well.
+    """Send a crowd of so many `bots` through the study at `link`, and print the report; return whether all is well.
 
     `data` is None if the folder of its data is not known. With `ends`, bots are sent to each of them instead.
     """
-    functions = FunctionLog(data) if data else None
-    servers = ServerLogs(data) if data else None
-    with _bar(console, len(ends.goals()) if ends else crowd.bots) as watch:
-        walking = _to_ends(ends, link, crowd, watch) if ends else rehearse(link, crowd, watch)
-        reports = interruptible(walking)
+    logs = StudyLogs(data) if data else None
+    with _bar(console, len(ends.goals()) if ends else bots) as watch:
+        reports = interruptible(ends.rehearse(link, crowd, watch) if ends else crowd.rehearse(link, bots, watch))
     servers_left = None
     if data:
         ids = {bot.user_id for bot in reports}
@@ -220,8 +170,8 @@ def _rehearse_and_report(
         play=crowd.play,
         recorded=config.trial.s3upload,
         live=config.project.live or bool(study and crowd.play > 0),  # the copy for bots is live
-        warnings=functions.warnings() if functions else (),
-        crashes=servers.crashes({str(study.folder): str(folder)} if study else {}) if servers else (),
+        warnings=logs.warnings() if logs else (),
+        crashes=logs.crashes({str(study.folder): str(folder)} if study else {}) if logs else (),
     )
     all_reached = reached.report(console, ends, read_source(folder)) if ends else True
     if not fine and study:
@@ -281,13 +231,13 @@ def command(
                 folder,
                 config,
                 Crowd(
-                    bots,
-                    play=play,
                     at_once=max(at_once, config.project.players),
-                    patience=patience,
                     ramp=ramp,
+                    play=play,
+                    patience=patience,
                     right={step.key: step.step.right for step in config.steps if step.step and step.step.right},
                 ),
+                bots,
                 link=study.link if study else str(link),
                 data=place,
                 study=study,

@@ -1,4 +1,4 @@
-"""`try --ends`: sends bots to each cell of `conditions` and to each end, and says where nobody came.
+"""Sends bots through a study; with `try --ends` to each cell of `conditions` and each end, and says where nobody came.
 
 The bots choose their answers by the rules of the ends (`bots/steering.py`). Whoever has not come where they were sent
 is followed by another bot, at most ROUNDS times.
@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import secrets
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -36,6 +35,32 @@ ROUNDS = 3
 BY_CHANCE = 8
 """Bots for an end that depends on chance: on a game, or on the cell that is drawn for people who play together."""
 Watch = Callable[[Sequence[BotReport]], None]
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """How bots walk through the study. `at_once` is how many walk at one time; times are in seconds."""
+
+    at_once: int
+    ramp: float
+    play: float
+    patience: float
+    right: Mapping[str, Mapping[str, str]]  # the right answers of checks, by step
+
+    async def rehearse(self, link: str, number: int, watch: Watch) -> list[BotReport]:
+        """Send so many bots through the study, and return their reports. If this is cancelled, all bots end."""
+        run, width = secrets.token_hex(3), len(str(number))
+        bots = [
+            self.bot(link, f"bot-{run}-{n:0{width}}", Random(f"{run}{n}"))  # noqa: S311 - bots
+            for n in range(1, number + 1)
+        ]
+        return await self.walk(bots, watch)
+
+    async def walk(self, bots: Sequence[Bot], watch: Watch) -> list[BotReport]:
+        return await walk(bots, at_once=self.at_once, ramp=self.ramp, watch=watch)
+
+    def bot(self, link: str, user_id: str, random: Random, steering: Steering | None = None) -> Bot:
+        return Bot(link, user_id, random, play=self.play, patience=self.patience, right=self.right, steering=steering)
 
 
 @dataclass(frozen=True)
@@ -108,33 +133,30 @@ class Ends:
         steps = {names[1] for rule in end.when for names in rules.mentioned(rule) if names[0] == "answers"}
         return sorted(step.key for step in self.design.steps if step.type.on_server and step.key in steps)
 
-    async def rehearse(self, link: str, watch: Watch, *, at_once: int, ramp: float, **bot: Any) -> list[BotReport]:
-        """Send bots until nothing is left to reach, at most ROUNDS times. Return their reports.
-
-        `bot` are further arguments of `Bot`.
-        """
+    async def rehearse(self, link: str, crowd: Crowd, watch: Watch) -> list[BotReport]:
+        """Send bots until nothing is left to reach, at most ROUNDS times. Return their reports."""
         for _ in range(ROUNDS):
             goals = self.goals()
             if not goals:
                 break
             run, before = secrets.token_hex(3), [walk.report for walk in self.walks]
-            bots = [self._bot(link, f"bot-{run}-{number:03}", goal, **bot) for number, goal in enumerate(goals, 1)]
+            bots = [self._bot(link, f"bot-{run}-{number:03}", goal, crowd) for number, goal in enumerate(goals, 1)]
 
             def watch_all(reports: Sequence[BotReport], before: Sequence[BotReport] = before) -> None:
                 watch([*before, *reports])
 
-            reports = await walk(bots, at_once=at_once, ramp=ramp, watch=watch_all)
+            reports = await crowd.walk(bots, watch_all)
             self.walks += [self._walk(goal, report) for goal, report in zip(goals, reports, strict=True)]
         return [walk.report for walk in self.walks]
 
-    def _bot(self, link: str, user_id: str, goal: Goal, **bot: Any) -> Bot:
+    def _bot(self, link: str, user_id: str, goal: Goal, crowd: Crowd) -> Bot:
         random = Random(user_id)  # noqa: S311 - bots
         steering = Steering(self.design, goal.end, random, self._levels[goal.cell] if goal.cell else None)
         steering.set_out()
         fields = {name: value for name, value in steering.participant.items() if name != "device"}
         if goal.cell:
             fields[FIELD] = goal.cell
-        return Bot(with_fields(link, fields), user_id, random, steering=steering, **bot)
+        return crowd.bot(with_fields(link, fields), user_id, random, steering)
 
     def _walk(self, goal: Goal, report: BotReport) -> Walk:
         path = self._data / participant_folder(self._config.project.id, report.user_id) / ASSIGNMENT

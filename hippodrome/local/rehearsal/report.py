@@ -13,7 +13,7 @@ from rich.table import Table
 
 from hippodrome.bots.report import BotReport, PlayedStep
 from hippodrome.bots.verification import Verification
-from hippodrome.local.rehearsal.crashes import AgentCrash
+from hippodrome.local.rehearsal.logs import AgentCrash
 from hippodrome.local.rehearsal.study_process import Leftovers
 
 EARLY = ("left", "partnerLeft", "ping")  # outcomes of games that ended early
