@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import html
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from hippodrome.control.participants.page_parser import VOID, PageParser, attributes_of
+from hippodrome.control.participants import markup
 
 PRESSED = ("submit", "image")
 """Types of the buttons that send a form."""
@@ -91,9 +92,13 @@ class Form:
 def read(page: str) -> list[Form]:
     """Return the forms of a page in their order."""
     reader = _Reader()
-    reader.feed(page)
-    reader.close()
-    return reader.forms
+    for token in markup.tokens(page):
+        reader.text(token.before)
+        if token.start and token.is_closed:
+            reader.start(token)
+        elif token.end:
+            reader.end(token.end)
+    return reader.all_forms()
 
 
 def to_answer(page: str) -> Form | None:
@@ -106,12 +111,11 @@ def hidden(form: Form) -> Iterator[tuple[str, str]]:
     return ((control.name, control.value) for control in form.controls if control.kind == "hidden")
 
 
-class _Reader(PageParser):
+class _Reader:
     """Gathers forms with their controls, as browsers do: it follows `form="…"` and disabled fieldsets."""
 
     def __init__(self) -> None:
-        super().__init__(convert_charrefs=True)
-        self.forms: list[Form] = []
+        self._forms: list[Form] = []
         self._by_id: dict[str, Form] = {}
         self._form: Form | None = None
         self._by_form_id: list[tuple[str, Control]] = []  # controls that name their form by `form="…"`
@@ -120,17 +124,16 @@ class _Reader(PageParser):
         self._option: dict[str, str] | None = None
         self._label: list[str] = []  # the text of the open option
         self._group_disabled = False
-        self._textarea: Control | None = None
         self._open: list[tuple[str, bool]] = []  # open elements, and whether each is hidden
 
-    def handle_starttag(self, tag: str, attrs: Iterable[tuple[str, str | None]]) -> None:
-        attributes = attributes_of(attrs)
+    def start(self, token: markup.Token) -> None:
+        tag, attributes = token.start, markup.attributes(token.attributes)
         while self._open and self._open[-1][0] in _ENDED_BY.get(tag, ()):
             self._open.pop()
         self._open.append((tag, _is_hidden(tag, attributes)))
         if tag == "form" and self._form is None:
             self._form = Form(attributes.get("action", ""), attributes.get("method", "get").lower())
-            self.forms.append(self._form)
+            self._forms.append(self._form)
             self._by_id.setdefault(attributes.get("id", ""), self._form)
         elif tag == "fieldset":
             self._fieldsets.append(_Fieldset("disabled" in attributes))
@@ -143,8 +146,7 @@ class _Reader(PageParser):
             kind = attributes.get("type", "submit").lower()
             self._add(Control(kind if kind in _NEVER_SENT else "submit", attributes))
         elif tag == "textarea":
-            self._textarea = Control("textarea", attributes)
-            self._add(self._textarea)
+            self._add(Control("textarea", attributes, text=html.unescape(token.content).removeprefix("\n")))
         elif tag == "select":
             self._select = Control("select", attributes)
             self._add(self._select)
@@ -154,12 +156,13 @@ class _Reader(PageParser):
         elif tag == "option" and self._select is not None:
             self._end_option()
             self._option, self._label = attributes, []
-        elif tag in ("script", "link") and self._form is not None:
-            self._form.may_change = True
-        if tag in VOID:
+        elif self._form is not None:
+            shows = tag == "style" and _SHOWING_STYLE.search(token.content) is not None
+            self._form.may_change |= shows or tag in ("script", "link")
+        if tag in markup.VOID or tag in markup.RAW:
             self._open.pop()
 
-    def handle_endtag(self, tag: str) -> None:
+    def end(self, tag: str) -> None:
         names = [name for name, _ in self._open]
         if tag in names:
             del self._open[len(names) - 1 - names[::-1].index(tag) :]
@@ -169,9 +172,6 @@ class _Reader(PageParser):
             self._fieldsets.pop()
         elif tag == "legend" and self._fieldsets:
             self._fieldsets[-1].in_legend = False
-        elif tag == "textarea" and self._textarea is not None:
-            self._textarea.text = self._textarea.text.removeprefix("\n")
-            self._textarea = None
         elif tag == "option":
             self._end_option()
         elif tag == "optgroup":
@@ -181,19 +181,16 @@ class _Reader(PageParser):
             self._end_option()
             self._select, self._group_disabled = None, False
 
-    def handle_data(self, data: str) -> None:
-        if self._textarea is not None:
-            self._textarea.text += data
-        elif self._option is not None:
-            self._label.append(data)
-        elif self._open and self._open[-1][0] == "style" and self._form is not None:
-            self._form.may_change |= _SHOWING_STYLE.search(data) is not None
+    def text(self, text: str) -> None:
+        if self._option is not None:
+            self._label.append(html.unescape(text))
 
-    def close(self) -> None:
-        super().close()
+    def all_forms(self) -> list[Form]:
+        """Return the forms, once the page is read."""
         for form_id, control in self._by_form_id:
             if form_id in self._by_id:
                 self._by_id[form_id].controls.append(control)
+        return self._forms
 
     def _add(self, control: Control) -> None:
         if "disabled" in control.attributes or any(fieldset.disables for fieldset in self._fieldsets):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hippodrome.bots import forms
-from hippodrome.control.participants.page_parser import PageParser, attributes_of
+from hippodrome.control.participants import markup
 
 
 @dataclass(frozen=True)
@@ -62,20 +62,8 @@ class VisitedPage:
 
 def links(page: str) -> list[str]:
     """Return the addresses of a page's links."""
-    reader = _Links()
-    reader.feed(page)
-    reader.close()
-    return reader.found
-
-
-class _Links(PageParser):
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag == "a":
-            self.found.append(attributes_of(attrs).get("href", "").strip())
+    tags = (token for token in markup.tokens(page) if token.start == "a")
+    return [markup.attributes(tag.attributes).get("href", "").strip() for tag in tags]
 
 
 def leads_elsewhere(address: str) -> bool:

@@ -6,13 +6,12 @@ number, and one ticked box of several is a list.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from enum import StrEnum
 
 from hippodrome.control.config.step_files import LIMIT_BYTES
 from hippodrome.control.model.project import Project
-from hippodrome.control.participants.page_parser import PageParser, attributes_of
+from hippodrome.control.participants import markup
 from hippodrome.export.source import FileGone, Source, TooLarge
 
 
@@ -42,10 +41,29 @@ def read_fields(source: Source, project: Project | None) -> dict[tuple[str, str]
 
 def fields_of(page: str) -> Mapping[str, FieldKind]:
     """Return the kinds of the fields of one page, by name, in the order of the page. Jinja is not rendered."""
-    reader = _Reader()
-    reader.feed(page)
-    reader.close()
-    return dict(reader.kinds())
+    kinds: dict[str, list[str]] = {}
+    for token in markup.tokens(page):
+        attributes, kind = markup.attributes(token.attributes), token.start
+        if token.start == "input":
+            kind = attributes.get("type", "").strip().lower()
+        elif token.start == "select" and "multiple" in attributes:
+            kind = "select multiple"
+        if token.start in ("input", "select", "textarea", "button") and attributes.get("name"):
+            kinds.setdefault(attributes["name"], []).append(kind)
+    return {name: _kind(of_name) for name, of_name in kinds.items()}
+
+
+def _kind(kinds: list[str]) -> FieldKind:
+    """The kind of the values of one name, of whose inputs these are the types."""
+    match kinds:
+        case ["number" | "range"]:
+            return FieldKind.NUMBER
+        case ["select multiple"]:
+            return FieldKind.LIST
+        case [_, _, *_] if set(kinds) == {"checkbox"}:
+            return FieldKind.LIST
+        case _:
+            return FieldKind.TEXT
 
 
 def _page(source: Source, key: str) -> str:
@@ -53,33 +71,3 @@ def _page(source: Source, key: str) -> str:
         return source.read(key, LIMIT_BYTES).decode("utf-8", "replace")
     except (FileGone, TooLarge):  # the types of columns then follow from the answers
         return ""
-
-
-class _Reader(PageParser):
-    """Counts the kinds of a page's fields, by name."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._counts: dict[str, Counter[str]] = {}
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        attributes = attributes_of(attrs)
-        kind = tag
-        if tag == "input":
-            kind = attributes.get("type", "").strip().lower()
-        elif tag == "select" and "multiple" in attributes:
-            kind = "select multiple"
-        if tag in ("input", "select", "textarea", "button") and attributes.get("name"):
-            self._counts.setdefault(attributes["name"], Counter())[kind] += 1
-
-    def kinds(self) -> Iterator[tuple[str, FieldKind]]:
-        for name, counts in self._counts.items():
-            match [*counts.items()]:
-                case [("number" | "range", 1)]:
-                    yield name, FieldKind.NUMBER
-                case [("checkbox", count)] if count > 1:
-                    yield name, FieldKind.LIST
-                case [("select multiple", 1)]:
-                    yield name, FieldKind.LIST
-                case _:
-                    yield name, FieldKind.TEXT

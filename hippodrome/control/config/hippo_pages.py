@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from hippodrome.control.config.project_keys import MAX_HOSTS, origin
-from hippodrome.control.participants.page_parser import PageParser
+from hippodrome.control.participants import markup
 
 _LOADED = {
     "img": ("src", "srcset"),
@@ -32,30 +32,21 @@ def hosts(pages: Iterable[Path]) -> tuple[str, ...]:
     """
     origins: dict[str, None] = {}
     for page in pages:
-        reader = _Addresses()
-        try:
-            reader.feed(page.read_bytes().decode("utf-8", "replace"))
-            reader.close()
-        except OSError:
-            continue
-        origins |= dict.fromkeys(reader.origins)
+        with contextlib.suppress(OSError):
+            origins |= dict.fromkeys(_origins(page.read_bytes().decode("utf-8", "replace")))
     return tuple(origins)[:MAX_HOSTS]
 
 
-class _Addresses(PageParser):
-    def __init__(self) -> None:
-        super().__init__()
-        self.origins: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        for name, value in attrs:
-            if name not in _LOADED.get(tag, ()):
+def _origins(page: str) -> Iterator[str]:
+    for token in markup.tokens(page):
+        for name, value in markup.attributes(token.attributes).items():
+            if name not in _LOADED.get(token.start, ()):
                 continue
             if name == "srcset":  # this attribute has several addresses
-                starts = _ORIGIN.findall(value or "")
+                starts = _ORIGIN.findall(value)
             else:
-                first = _ORIGIN.match((value or "").strip())
+                first = _ORIGIN.match(value.strip())
                 starts = [first[0]] if first else []
             for start in starts:
                 with contextlib.suppress(ValueError):
-                    self.origins.append(origin(start.removesuffix(":443")))
+                    yield origin(start.removesuffix(":443"))

@@ -12,38 +12,23 @@ from __future__ import annotations
 import html
 import re
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-from hippodrome.control.participants import sandbox
+from hippodrome.control.participants import markup, sandbox
 from hippodrome.control.participants.files import is_served
 
 _MARK = f"nonce-{secrets.token_hex(16)}"  # takes the nonce's place in prepared pages; known to this process only
 
-_JINJA_START = re.compile(r"\{[{%#]|\ue000")
-_JINJA_END = {"{{": "}}", "{%": "%}", "{#": "#}"}
 _PLACEHOLDER = re.compile("\ue000([0-9]+)\ue001")
-_TOKEN = re.compile(
-    r"""
-      <!--(?:>|->|(?P<comment>.*?)(?:--!?>|\Z))
-    | <[!?](?P<declaration>[^>]*+)>?
-    | </(?P<end>[a-zA-Z][^\s/>]*+)[^>]*+>?
-    | <(?P<start>[a-zA-Z][^\s/>]*+)(?P<attributes>(?:=\s*+(?:"[^"]*+"|'[^']*+')|[^>])*+)(?P<closed>>?)
-    """,
-    re.VERBOSE | re.DOTALL,
-)
-_ATTRIBUTE = re.compile(
-    r"""(?P<name>[^\s/>=][^\s/>=]*+)(?:\s*+=\s*+(?P<value>"[^"]*+"|'[^']*+'|[^\s>"'][^\s>]*+))?""", re.DOTALL
-)
 _ABSOLUTE = re.compile(r"/|#|\?|\ue000|[a-zA-Z][a-zA-Z0-9+.-]*:|\Z")
 _SRCSET = re.compile(r"(\A\s*|,\s+)(\S+)")
 _IGNORED = re.compile(r"\A[\0- ]+|[\t\r\n]")
 _NAMES_HOST = re.compile(r"//|https?:", re.IGNORECASE)
 _ORIGIN = re.compile(r"https?://[^/\s?#]+", re.IGNORECASE)
 
-_RAW = frozenset({"script", "style", "textarea", "title", "iframe", "xmp", "noembed", "noframes"})  # hold no tags
 _UNSEEN = frozenset({"template", "noscript"})  # browsers that run scripts show nothing in them
 _NO_SUBMIT = ("button", "reset")  # types of <button> that send no form
 _DROPPED = frozenset({"html", "head", "body", "form", "meta", "base"})
@@ -113,40 +98,34 @@ class _Preparation:
 
     def run(self) -> Fragment:
         out: list[str] = []
-        for before, token, inside, end in _tokens(self._source):
-            out += [before, self._tag(token) if token["closed"] else token[0], inside, end] if token else [before]
+        for token in markup.tokens(self._source):
+            written = self._tag(token) if token.start and token.is_closed else token.source
+            out += [token.before, written, token.content, token.end_tag]
         return Fragment(self._restore("".join(out)))
 
     def _set_aside(self, source: str) -> str:
         """The source with a placeholder for each expression of Jinja, and for text that looks like a placeholder."""
         out: list[str] = []
-        at = start = 0
-        unclosed: set[str] = set()
-        while match := _JINJA_START.search(source, at):
-            at = match.end()
-            if closer := _JINJA_END.get(match[0]):
-                if closer in unclosed or (end := source.find(closer, at)) == -1:
-                    unclosed.add(closer)
-                    continue
-                at = end + 2
-            out += [source[start : match.start()], f"\ue000{len(self._aside)}\ue001"]
-            self._aside.append(source[match.start() : at])
-            start = at
-        return "".join([*out, source[start:]])
+        at = 0
+        for start, end in markup.expressions(source):
+            out += [source[at:start], f"\ue000{len(self._aside)}\ue001"]
+            self._aside.append(source[start:end])
+            at = end
+        return "".join([*out, source[at:]])
 
     def _restore(self, text: str) -> str:
         return _PLACEHOLDER.sub(lambda held: self._aside[int(held[1])], text)
 
-    def _tag(self, token: re.Match[str]) -> str:
-        name, attributes = token["start"].lower(), token["attributes"]
-        address = _attributes(attributes).get("src", "") if name == "script" else ""
+    def _tag(self, token: markup.Token) -> str:
+        name, attributes = token.start, token.attributes
+        address = markup.attributes(attributes).get("src", "") if name == "script" else ""
         if name in LINKS and self._base:
             attributes = self._link(attributes)
         if name in ADDRESSES and self._base:
-            attributes = _ATTRIBUTE.sub(lambda attribute: self._relocated(attribute, *ADDRESSES[name]), attributes)
+            attributes = markup.ATTRIBUTE.sub(lambda found: self._relocated(found, *ADDRESSES[name]), attributes)
         if name == "script" and self._may_run(address):
             attributes = f' nonce="{_MARK}"{attributes}'
-        return f"<{token['start']}{attributes}>"
+        return f"{token.source[: 1 + len(name)]}{attributes}>"
 
     def _may_run(self, address: str) -> bool:
         """Whether a script is the researcher's: in the page, among the project's files, or on a host in `hosts`."""
@@ -158,11 +137,11 @@ class _Preparation:
 
     def _link(self, attributes: str) -> str:
         """The attributes of a link. Only a link to a file is changed: `next?…`, for one, is an address of ours."""
-        values = _attributes(attributes)
+        values = markup.attributes(attributes)
         relocated = self._relocate(values.get("href", ""))
         if not relocated.startswith(self._base) or not is_served(re.split(r"[?#]", relocated, maxsplit=1)[0]):
             return attributes
-        attributes = _ATTRIBUTE.sub(lambda attribute: self._relocated(attribute, "href"), attributes)
+        attributes = markup.ATTRIBUTE.sub(lambda found: self._relocated(found, "href"), attributes)
         return (
             attributes if "target" in values or "download" in values else f' target="_blank" rel="noopener"{attributes}'
         )
@@ -196,16 +175,14 @@ class _Filled:
         self._unseen = ""  # the open element whose content browsers do not show
 
     def read(self, page: str) -> Content:
-        for before, token, inside, end in _tokens(page):
-            self._out.append(before)
-            if token is None:
-                break
-            if token["start"] is not None:
-                self._start(token, inside, end)
-            elif token["end"] is not None:
+        for token in markup.tokens(page):
+            self._out.append(token.before)
+            if token.start:
+                self._start(token)
+            elif token.end:
                 self._end(token)
-            elif token["declaration"] is None:
-                self._out.append(token[0] if token[0].endswith(">") else token[0] + "-->")
+            elif token.is_comment:
+                self._out.append(token.source if token.is_closed else token.source + "-->")
         return Content(
             html="".join(self._out),
             has_fields="field" in self._seen,
@@ -215,30 +192,29 @@ class _Filled:
             lang=self._lang,
         )
 
-    def _start(self, token: re.Match[str], inside: str, end: str) -> None:
-        """Copy a start tag; for a script and other elements in `_RAW`, all up to the end tag."""
-        name = token["start"].lower()
-        if not token["closed"]:  # a tag that never ends would swallow what follows in the frame
-            self._out.append(token[0].replace("<", "&lt;"))
+    def _start(self, token: markup.Token) -> None:
+        """Copy a start tag; for a script and other elements whose content is text, all up to the end tag."""
+        name = token.start
+        if not token.is_closed:  # a tag that never ends would swallow what follows in the frame
+            self._out.append(token.source.replace("<", "&lt;"))
             return
-        self._note(name, _attributes(token["attributes"]))
-        self._drawings += name == "svg" and not token["attributes"].endswith("/")
+        self._note(name, markup.attributes(token.attributes))
+        self._drawings += name == "svg" and not token.attributes.endswith("/")
         if name in _UNSEEN and not self._unseen:
             self._unseen = name
         if name == "title" and self._drawings <= 0:
-            self._title = " ".join(html.unescape(inside).split())[:200]
-        elif name in _RAW:
-            self._out += [token[0], inside, end or f"</{name}>"]
+            self._title = " ".join(html.unescape(token.content).split())[:200]
+        elif name in markup.RAW:
+            self._out += [token.source, token.content, token.end_tag or f"</{name}>"]
         elif name not in _DROPPED:
-            self._out.append(token[0])
+            self._out.append(token.source)
 
-    def _end(self, token: re.Match[str]) -> None:
-        name = token["end"].lower()
-        self._drawings -= name == "svg"
-        if name == self._unseen:
+    def _end(self, token: markup.Token) -> None:
+        self._drawings -= token.end == "svg"
+        if token.end == self._unseen:
             self._unseen = ""
-        if name not in _DROPPED:
-            self._out.append(token[0] if token[0].endswith(">") else token[0].replace("<", "&lt;"))
+        if token.end not in _DROPPED:
+            self._out.append(token.source if token.is_closed else token.source.replace("<", "&lt;"))
 
     def _note(self, name: str, attributes: Mapping[str, str]) -> None:
         """Note the facts about this tag that the frame needs."""
@@ -252,40 +228,3 @@ class _Filled:
             self._seen.add("h1")
         if name == "html" and not self._lang and re.fullmatch(r"[A-Za-z0-9-]{2,35}", attributes.get("lang", "")):
             self._lang = attributes["lang"]
-
-
-def _tokens(text: str) -> Iterator[tuple[str, re.Match[str] | None, str, str]]:
-    """Yield each tag, comment and declaration: the text before it, and the token itself; last the text after them all.
-
-    For an element in `_RAW` its content and its end tag follow, which are empty for all others.
-    """
-    at = 0
-    while token := _TOKEN.search(text, at):
-        before, at = text[at : token.start()], token.end()
-        inside = end = ""
-        if token["closed"] and token["start"].lower() in _RAW:
-            inside, end = _content(text, token["start"].lower(), at)
-            at += len(inside) + len(end)
-        yield before, token, inside, end
-    yield text[at:], None, "", ""
-
-
-def _content(text: str, name: str, at: int) -> tuple[str, str]:
-    """The content from `at` on of an element in `_RAW`, and its end tag, which is empty if the element never ends.
-
-    Only the first end tag counts: if no ">" follows it, none follows a later one either.
-    """
-    end = re.compile(rf"</{name}(?=[\s/>])", re.IGNORECASE).search(text, at)
-    if end is None or (close := text.find(">", end.end())) == -1:
-        return text[at:], ""
-    return text[at : end.start()], text[end.start() : close + 1]
-
-
-def _attributes(text: str) -> dict[str, str]:
-    """The values of attributes by their names in lower case. Of two with one name, the first counts, as in browsers."""
-    attributes: dict[str, str] = {}
-    for attribute in _ATTRIBUTE.finditer(text):
-        value = attribute["value"] or ""
-        value = value[1:-1] if value[:1] in ('"', "'") else value
-        attributes.setdefault(attribute["name"].lower(), html.unescape(value))
-    return attributes

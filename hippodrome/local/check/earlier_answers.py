@@ -14,8 +14,9 @@ from hippodrome.bots import form_filling, forms
 from hippodrome.control.config import Config
 from hippodrome.control.config.config import StepFiles
 from hippodrome.control.participants import fragments
+from hippodrome.control.participants.markup import MARK
 from hippodrome.control.participants.sandbox import FragmentError
-from hippodrome.local.check import spans
+from hippodrome.local.check.page_source import PageSource
 from hippodrome.protocol.answer import UNMATCHED
 
 
@@ -83,7 +84,7 @@ class EarlierAnswers:
             return [*_PLAYED, *_PLAYED_TOGETHER]
         texts = [source_of(file) for file in step.files]
         names = [control.name for text in texts for form in _forms(text) for control in form.controls if control.name]
-        may_have_more = any("<script" in text.lower() for text in texts) or any(spans.MARK in name for name in names)
+        may_have_more = any("<script" in text.lower() for text in texts) or any(MARK in name for name in names)
         return None if may_have_more else list(dict.fromkeys(names))
 
     def why_no_step(self, key: str) -> str | None:
@@ -189,8 +190,8 @@ _PLAYED_TOGETHER = ("scores", "session", "player")  # what an answer holds in ga
 
 
 def every_branch(text: str) -> fragments.Content:
-    """Return a page with all branches of its template, and with `spans.MARK` in the place of each Jinja expression."""
-    return fragments.prepare(spans.replace(text, lambda _: spans.MARK, *spans.JINJA)).fill({})
+    """Return a page with all branches of its template, and with marks in the place of each Jinja expression."""
+    return fragments.prepare(PageSource(text).text).fill({})
 
 
 def _forms(text: str) -> list[forms.Form]:
@@ -237,7 +238,7 @@ def _possible(text: str, numbers: Sequence[float], texts: Sequence[str]) -> dict
             values = [f"{number:g}" for number in numbers if _is_within(control, number)]
         else:
             values = [*texts, *(f"{number:g}" for number in numbers)]
-        found.setdefault(control.name, []).extend(value for value in values if spans.MARK not in value)
+        found.setdefault(control.name, []).extend(value for value in values if MARK not in value)
     return found
 
 
@@ -264,7 +265,7 @@ def _choices(controls: Sequence[forms.Control]) -> set[str] | None:
         unanswered = False
     else:
         return None
-    if any(spans.MARK in value for value in found):
+    if any(MARK in value for value in found):
         return None
     return {value.strip().casefold() for value in found} | ({""} if unanswered else set())
 

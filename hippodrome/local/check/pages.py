@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 from jinja2 import meta
 
-from hippodrome.bots.page import leads_elsewhere, links
+from hippodrome.bots.page import leads_elsewhere
 from hippodrome.control.config import Config, Diagnostic
 from hippodrome.control.config.layout import PAGES
 from hippodrome.control.config.step_files import StepFileError, open_folder
-from hippodrome.control.participants import sandbox
+from hippodrome.control.participants import markup, sandbox
 from hippodrome.control.participants.files import MAX_BYTES
-from hippodrome.local.check import spans
 from hippodrome.local.check.earlier_answers import EarlierAnswers, every_branch, source_of
+from hippodrome.local.check.page_source import PageSource
 from hippodrome.local.check.structure import check_structure
 from hippodrome.local.check.tags import Tags
 from hippodrome.local.check.templates import Visitors, check_template
 from hippodrome.protocol.values import printable
-
-_CODE = re.compile(r"""\bclass=["']?code\b""", re.IGNORECASE)
-"""A code that the researcher has written."""
 
 
 def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
@@ -45,10 +41,11 @@ def check_pages(folder: Path, config: Config | None) -> list[Diagnostic]:
         label = f"{steps.path.name}/{name}"
         earlier = EarlierAnswers.before_page(steps.path, config, name)
         send_it = config is not None and _is_sent(config, name, source)
+        page = PageSource(source)
         here = [
             *check_template(label, source, config, Visitors(groups, earlier, send_it)),
-            *Tags(label, steps.names, config).read(source),
-            *(replace(problem, remark=problem.remark or of_hippo) for problem in check_structure(label, source)),
+            *Tags(label, steps.names, config).read(page),
+            *(replace(problem, remark=problem.remark or of_hippo) for problem in check_structure(label, page)),
         ]
         diagnostics += sorted(dict.fromkeys(here), key=lambda problem: problem.line or 0)
     return diagnostics + (_of_all(steps.path, steps.names, config) if config else [])
@@ -109,10 +106,14 @@ def _leads_back(source: str) -> bool:
             return True
     except Exception:  # noqa: BLE001 - the check of the page reports what Jinja cannot read
         return True
-    page = every_branch(source).html
-    by_script = any("://" in page[script.inside : script.until] for script in spans.spans(page, spans.SCRIPT))
-    by_link = any(leads_elsewhere(address) or address.startswith(spans.MARK) for address in links(page))
-    return by_script or by_link or _CODE.search(page) is not None
+    for token in markup.tokens(every_branch(source).html):
+        attributes = markup.attributes(token.attributes)
+        address = attributes.get("href", "").strip() if token.start == "a" else ""
+        if leads_elsewhere(address) or address.startswith(markup.MARK):
+            return True
+        if "code" in attributes.get("class", "").split() or (token.start == "script" and "://" in token.content):
+            return True
+    return False
 
 
 def _pages(names: Iterable[str], config: Config | None) -> dict[str, list[int | None]]:

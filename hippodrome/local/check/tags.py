@@ -7,10 +7,10 @@ from collections.abc import Iterable
 from urllib.parse import unquote, urlsplit
 
 from hippodrome.control.config import Config, Diagnostic
-from hippodrome.control.participants import fragments
+from hippodrome.control.participants import fragments, markup
 from hippodrome.control.participants.files import KINDS, is_served
-from hippodrome.control.participants.page_parser import PageParser, attributes_of
-from hippodrome.local.check import spans
+from hippodrome.control.participants.markup import MARK
+from hippodrome.local.check.page_source import PageSource
 from hippodrome.local.check.wording import short
 from hippodrome.protocol.file_names import composed
 from hippodrome.protocol.similar import SIMILAR_FILES, did_you_mean
@@ -29,11 +29,10 @@ _SCRIPT = (
 _LOADED = {**fragments.ADDRESSES, "iframe": ("src",), "embed": ("src",), "object": ("data",)}
 
 
-class Tags(PageParser):
+class Tags:
     """Finds the tags of a page that do not work, in browsers or in the frame around pages."""
 
     def __init__(self, label: str, names: Iterable[str], config: Config | None) -> None:
-        super().__init__()
         self._label = label
         self._folder = label.partition("/")[0]
         self._names = frozenset(map(composed, names))
@@ -41,17 +40,19 @@ class Tags(PageParser):
         self._hosts = frozenset(config.project.allowed_hosts) if config else None
         self._found: list[Diagnostic] = []
         self._unnamed: list[tuple[int, str]] = []  # line and tag of each field without a name
-        self._styling = False
+        self._line = 1
 
-    def read(self, source: str) -> list[Diagnostic]:
+    def read(self, page: PageSource) -> list[Diagnostic]:
         """Return the problems of a page's tags. What a Jinja expression stands for is not checked."""
-        self.feed(spans.replace(source, lambda jinja: spans.MARK + spans.lines(jinja), *spans.JINJA))
-        self.close()
+        for self._line, token in page.tokens():
+            if token.start and token.is_closed:
+                attributes = markup.attributes(token.attributes)
+                self._start(token.start, {name: value.strip() for name, value in attributes.items()})
+            if token.start == "style":
+                self._style(token.content, token.source.count("\n"))
         return [*self._found, *self._without_a_name()]
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        attributes = {name: value.strip() for name, value in attributes_of(attrs).items()}
-        self._styling = tag == "style"
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
         self._field(tag, attributes)
         self._left_out(tag, attributes)
         for name, value in attributes.items():
@@ -69,19 +70,12 @@ class Tags(PageParser):
                 for address in _IN_SRCSET.findall(value) if name == "srcset" else [value]:
                     self._address(tag, address, attributes)
 
-    def handle_endtag(self, tag: str) -> None:
-        self._styling = False
-
-    def handle_data(self, data: str) -> None:
-        if self._styling:
-            self._style(data)
-
     def _field(self, tag: str, attributes: dict[str, str]) -> None:
         kind = attributes.get("type", "").lower() if tag == "input" else tag
         if kind == "file":
             self._mistake("files cannot be sent; take this field out")
         elif tag in ("input", "select", "textarea") and kind not in BUTTONS and not attributes.get("name"):
-            self._unnamed.append((self.getpos()[0], tag))
+            self._unnamed.append((self._line, tag))
 
     def _left_out(self, tag: str, attributes: dict[str, str]) -> None:
         """Remark on tags that the frame leaves out, where a page would need them."""
@@ -107,13 +101,14 @@ class Tags(PageParser):
             message += f": {_lines(sorted({line for line, _ in self._unnamed}))}"
         return [Diagnostic(self._label, first, "", message, remark=True)]
 
-    def _style(self, text: str) -> None:
+    def _style(self, text: str, line: int = 0) -> None:
+        """Remark on the files of a style that begins `line` lines after its tag."""
         for match in _IN_STYLE.finditer(text):
             address = match[1]
-            if spans.MARK not in address and not address.startswith(("/", "#")) and not _SCHEME.match(address):
+            if MARK not in address and not address.startswith(("/", "#")) and not _SCHEME.match(address):
                 place = f"{self._own or '/steps/your-project/'}{address.removeprefix('./')}"
-                line = text[: match.start()].count("\n")
-                self._remark(f"{short(address)} is not found from a style; write url({short(place)})", line)
+                message = f"{short(address)} is not found from a style; write url({short(place)})"
+                self._remark(message, line + text.count("\n", 0, match.start()))
 
     def _address(self, tag: str, address: str, attributes: dict[str, str]) -> None:
         """Check whether the file or the page at this address can be loaded."""
@@ -124,9 +119,9 @@ class Tags(PageParser):
             return
         if self._is_elsewhere(address):
             host = _HOST.match(address)
-            if host is None or spans.MARK not in host[0]:
+            if host is None or MARK not in host[0]:
                 self._elsewhere(tag, host[0] if host else address, "stylesheet" in relations)
-        elif address.startswith(spans.MARK):
+        elif address.startswith(MARK):
             if tag == "script":
                 self._mistake(_SCRIPT)
             elif tag in fragments.ADDRESSES:
@@ -135,7 +130,7 @@ class Tags(PageParser):
             self._remark(f"<{tag}> cannot show a file of the project")
         elif not address.startswith(("#", "?")):
             path = _path(address)
-            if spans.MARK not in path:
+            if MARK not in path:
                 self._file(path)
             elif tag == "script":
                 self._mistake(_SCRIPT)
@@ -143,9 +138,9 @@ class Tags(PageParser):
     def _link(self, address: str) -> None:
         """Check whether the file at this address can be opened. A link to another site opens whatever it names."""
         path = _path(address)
-        if address.startswith(spans.MARK):
+        if address.startswith(MARK):
             self._begins_with_a_value(address)
-        if not path or spans.MARK in path or self._on_disk(address) or self._is_elsewhere(address):
+        if not path or MARK in path or self._on_disk(address) or self._is_elsewhere(address):
             return
         if path.startswith("/") and not path.startswith("/steps/"):
             return
@@ -209,10 +204,10 @@ class Tags(PageParser):
         self._remark(message)
 
     def _remark(self, message: str, line: int = 0) -> None:
-        self._found.append(Diagnostic(self._label, self.getpos()[0] + line, "", message, remark=True))
+        self._found.append(Diagnostic(self._label, self._line + line, "", message, remark=True))
 
     def _mistake(self, message: str) -> None:
-        self._found.append(Diagnostic(self._label, self.getpos()[0], "", message))
+        self._found.append(Diagnostic(self._label, self._line, "", message))
 
 
 def _path(address: str) -> str:

@@ -119,6 +119,7 @@ def test_tags_inside_scripts_comments_and_text_fields_are_text() -> None:
         ("<script>x", "</script>"),
         ("<script>x</script y", "<script>x</script y</script>"),
         ("<!-- x", "<!-- x-->"),
+        ("<!-- x <p>", "<!-- x <p>-->"),
         ("x <b", "x &lt;b"),
         ("x </b", "x &lt;/b"),
     ],

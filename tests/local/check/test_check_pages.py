@@ -278,6 +278,7 @@ def radio(name: str, *values: str) -> str:
         ('<input type="radio" name="q" value="a">\n<input type="radio" name="q">', 3, "this choice of q has no value"),
         ("a\n<textarea name=x>\n<p>more", 3, "<textarea> is never closed, so the rest of the page is not shown"),
         ("<script>let a = 1", 2, "<script> is never closed"),
+        ("<script src='https://media.example/x.js'/>\n<p>", 2, "<script> is never closed, so the rest of the page is not shown"),
         ("a\n<!-- a comment\n<p>", 3, "this comment is never closed"),
         ("<script>\nconst a = '{{ answers['1'].a }}'\n</script>", 3, "in a <script>, write {{ answers['1'].a|tojson }}"),
         ("<script>var id = {{ participant.PROLIFIC_PID }};</script>", 2, "in a <script>, write {{ participant.PROLIFIC_PID|tojson }}"),
