@@ -131,12 +131,13 @@ def command(
         _erase(looks)
     finally:
         written = paper.written(looks)
-        if written["complete"] or any(erasure.eraser.deleted for erasure in looks):
+        if not _concerned(looks) or any(erasure.eraser.deleted for erasure in looks):
             _write(target, written)
     if as_json:
         screen.result_json(written)
     _warn(place, user_id)
-    screen.success(f"{'Everything is gone' if concerned else NOTHING}. The receipt: {target}")
+    gone = "Everything is gone" if written["complete"] else "Everything that can be read is gone"
+    screen.success(f"{gone if concerned else NOTHING}. The receipt: {target}")
     if concerned:
         screen.info("  Where this study was downloaded, run `hippodrome data` again: it removes them there.")
     else:
@@ -250,7 +251,7 @@ class Receipt:
         return {
             "schema": 1,
             "what": "erasure of a participant's data",
-            "complete": not _concerned(looks),
+            "complete": not _concerned(looks) and not any(erasure.eraser.unreadable for erasure in looks),
             "person": self._person,
             **self._place.about,
             "began": self._began,
@@ -262,6 +263,7 @@ class Receipt:
                     "rewritten": list(erasure.eraser.rewritten),  # documents that others share
                     "ended": erasure.ended,
                     "left": left,
+                    "unreadable": list(erasure.eraser.unreadable),
                 }
                 for erasure, left in looks.items()
             ],

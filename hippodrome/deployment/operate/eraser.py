@@ -115,7 +115,8 @@ class Eraser:
     def look(self) -> Found:
         """Find everything about this participant. Changes nothing."""
         own = [*self._in_lobby(), *self._own()]
-        return Found(own, [key for key in self._shared() if self._names(self._body(key))], self.sessions())
+        shared = [key for key in self._shared() if key not in self.unreadable and self._names(self._body(key))]
+        return Found(own, shared, self.sessions())
 
     def sessions(self) -> list[FoundSession]:
         """Find the sessions whose documents name the participant, in any version; and by their membership."""

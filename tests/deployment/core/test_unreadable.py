@@ -181,6 +181,7 @@ def test_erase_names_unreadable_documents_and_goes_on(
     assert ran.code == Exit.DONE, ran.err
     assert not [key for key in world.keys("maze/users/") if USER in key]
     assert "maze/slots/3.json in hippodrome cannot be read" in " ".join(ran.err.split())
+    assert "Everything that can be read is gone" in ran.err
     assert "maze/slots/4.json" not in ran.err
 
 
