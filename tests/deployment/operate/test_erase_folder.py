@@ -22,6 +22,7 @@ from hippodrome.control.limits.rules import ParticipantSlots
 from hippodrome.control.lobby import decisions
 from hippodrome.control.lobby.decisions import Decisions, Unmatched
 from hippodrome.control.model import ids, server
+from hippodrome.control.model.balance import Cells, Draw, cells_key
 from hippodrome.control.model.records import from_json, to_json
 from hippodrome.control.model.server import Server, ServerState
 from hippodrome.deployment.operate import folder_erasure
@@ -42,6 +43,7 @@ from tests.export.session_world import (
     packed,
     pair,
     recording_key,
+    round_trip,
     said,
     session,
     study,
@@ -345,23 +347,43 @@ def interrupt_at(at: int, after: bool) -> Iterator[None]:
         yield
 
 
+def crowded(folder: Path, capsys: Any) -> Machine:
+    """Make a study in which every document that participants share names Ann."""
+    machine = Machine(folder, capsys)
+    machine.tmp.mkdir()
+    study(machine.put, machine.tmp)
+    machine.put(tape_key(), tape())
+    machine.put(f"_lobby/maze/{LABEL}.way", b"{}")
+    then = datetime(2026, 11, 21, tzinfo=UTC)
+    machine.put(decisions.key("maze"), to_json(Decisions(1, unmatched=(Unmatched(LABEL, ANN, then),))))
+    machine.put("maze/slots/0.json", to_json(ParticipantSlots((LABEL, "sother"), 3)))
+    machine.put(cells_key("maze"), to_json(Cells(drawn={ANN: Draw("a", then), BOB: Draw("a", then)})))
+    return machine
+
+
 @pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
-def test_a_run_after_an_interruption_at_any_change_finishes(tmp_path: Path, capsys: Any, after: bool) -> None:
+def test_a_run_after_an_interruption_at_any_change_leaves_what_a_whole_run_leaves(
+    tmp_path: Path, capsys: Any, after: bool
+) -> None:
+    whole = crowded(tmp_path / "whole", capsys)
+    FolderErasure(whole.data, "maze", ANN).run()
+    assert whole.traces() == []
+    assert all(said(BOB).encode() in whole.contents()[key] for key in (recording_key(), tape_key()))
     for at in range(1, 60):
-        machine = Machine(tmp_path / str(at), capsys)
-        machine.tmp.mkdir()
-        study(machine.put, machine.tmp)
-        machine.put(f"_lobby/maze/{LABEL}.way", b"{}")
+        machine = crowded(tmp_path / str(at), capsys)
         try:
             with interrupt_at(at, after):
                 FolderErasure(machine.data, "maze", ANN).run()
             break
         except Interruption:
             FolderErasure(machine.data, "maze", ANN).run()
-        assert machine.traces() == [], at
-        assert said(BOB).encode() in machine.contents()[recording_key()]
-        assert [path for path in machine.data.rglob("*") if ".erase" in path.name or path.suffix == ".new"] == []
-    assert 8 < at < 59
+        assert machine.contents() == whole.contents(), at
+    assert 12 < at < 59
+    tables = tmp_path / "tables"
+    assert main(["data", "maze", "--from", str(whole.data), "--to", str(tables)]) == Exit.DONE
+    told = "".join(path.read_text() for path in tables.glob("*.csv"))
+    assert BOB in told
+    assert not [word for word in (ANN, said(ANN), LABEL, str(round_trip(ANN))) if word in told]
 
 
 @pytest.mark.parametrize("owner", [ANN, SID])
