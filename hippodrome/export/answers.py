@@ -25,7 +25,7 @@ from hippodrome.export.keys import ASSIGNED, ENDED
 from hippodrome.export.page_fields import FieldKind
 from hippodrome.export.records import Record
 from hippodrome.export.scrub import clean
-from hippodrome.export.table_files import Column, Table, fit
+from hippodrome.export.table_files import Column, Table, as_columns, fit
 from hippodrome.export.values import as_number, as_text, as_truth, as_whole, json_text, when
 from hippodrome.protocol.session import is_session_id
 
@@ -181,10 +181,7 @@ class Answers(Table):
     @property
     def columns(self) -> list[Column]:
         return _distinct(
-            Column("participant"),
-            Column("group", "whole"),
-            Column("arrived", "time"),
-            Column("finished", "truth"),
+            *as_columns("participant group:whole arrived:time finished:truth"),
             *self._design_columns(),
             *(_MEMBERSHIP if self._in_sessions else ()),
             *([] if self._apart else [Column("completionCode")]),
@@ -264,15 +261,7 @@ class LongAnswers(Table):
     """A row per value that was sent, and one for each text of a list."""
 
     name = "answers-long"
-    columns = (
-        Column("participant"),
-        Column("step"),
-        Column("page"),
-        Column("group", "whole"),
-        Column("answered", "time"),
-        Column("field"),
-        Column("value"),
-    )
+    columns = as_columns("participant step page group:whole answered:time field value")
 
     def __init__(self, answers: Answers) -> None:
         self._answers = answers
@@ -348,14 +337,7 @@ class Tries(Table):
     """A row for each field of each try at a check."""
 
     name = "tries"
-    columns = (
-        Column("participant"),
-        Column("step"),
-        Column("try", "whole"),
-        Column("answered", "time"),
-        Column("field"),
-        Column("value"),
-    )
+    columns = as_columns("participant step try:whole answered:time field value")
 
     def __init__(self) -> None:
         self.needed = False
@@ -384,7 +366,7 @@ def assignment_in(documents: Documents) -> Assignment | None:
         return None
 
 
-_MEMBERSHIP = (Column("session"), Column("seat", "whole"), Column("unmatched", "truth"), Column("waited", "number"))
+_MEMBERSHIP = as_columns("session seat:whole unmatched:truth waited:number")
 
 
 def _membership(record: Record) -> list[Any]:

@@ -34,12 +34,14 @@ class KeyKind(StrEnum):
     FOREIGN = "foreign"  # a file that Hippodrome does not write
 
 
-_OWN = {
+_OF_PARTICIPANT = {
     "participant.json": (KeyKind.PARTICIPANT, ""),
     "session.json": (KeyKind.MEMBERSHIP, ""),
     "assignment.json": (KeyKind.ANSWER, ASSIGNED),
     "end.json": (KeyKind.ANSWER, ENDED),
 }
+_OF_SESSION = {"session.json": (KeyKind.SESSION, ""), "assignment.json": (KeyKind.ANSWER, ASSIGNED)}
+"""A session's assignment is a copy of each member's."""
 
 
 class Listed(NamedTuple):
@@ -75,56 +77,30 @@ def read(project: str, listed: Listed) -> Item:
 
     All parts of the result are valid, so they can be used in paths of the export folder.
     """
-    if listed.key.startswith(sessions_folder(project)):
-        return _read_session(project, listed)
-    parts = listed.key.removeprefix(prefix(project)).split("/")
-    user = parts[0] if len(parts) > 1 and ids.is_user_id(parts[0]) else ""
-    if not user:
-        return Item(KeyKind.FOREIGN, listed, why="it is in no participant's folder")
-
-    def foreign(why: str) -> Item:
-        return Item(KeyKind.FOREIGN, listed, user, why=why)
-
-    if listed.key.endswith((".part", ".new")):
-        return foreign("it was still being written")
-    match parts[1:]:
-        case [name] if name in _OWN:
-            return Item(_OWN[name][0], listed, user, _OWN[name][1])
-        case ["answers", name] if name.endswith(".json"):
-            step, dot, number = name.removesuffix(".json").partition(".")
-            if not NAME.fullmatch(step) or step in RESERVED or (dot and not _TRY.fullmatch(number)):
-                return foreign("no step can have that name")
-            return Item(KeyKind.ANSWER, listed, user, f"{step}{dot}{number}")
-        case ["trials", server, name] if name.endswith(_END) or _PIECE.fullmatch(name):
-            return _recording(listed, user, server, name) or foreign("no recording has that name")
-    return foreign("Hippodrome writes no such file")
-
-
-def _read_session(project: str, listed: Listed) -> Item:
-    parts = listed.key.removeprefix(sessions_folder(project)).split("/")
-    session = parts[0] if len(parts) > 1 and is_session_id(parts[0]) else ""
+    in_sessions = listed.key.startswith(sessions_folder(project))
+    owner, *parts = listed.key.removeprefix(sessions_folder(project) if in_sessions else prefix(project)).split("/")
+    if not parts or not (is_session_id(owner) if in_sessions else ids.is_user_id(owner)):
+        return Item(KeyKind.FOREIGN, listed, why=f"it is in no {'session' if in_sessions else 'participant'}'s folder")
+    own = _OF_SESSION if in_sessions else _OF_PARTICIPANT
     why = "Hippodrome writes no such file"
-    if not session:
-        why = "it is in no session's folder"
-    elif listed.key.endswith((".part", ".new")):
-        why = "it was still being written"
-    elif parts[1:] == ["session.json"]:
-        return Item(KeyKind.SESSION, listed, session)
-    elif parts[1:] == ["assignment.json"]:  # each member has a copy
-        return Item(KeyKind.ANSWER, listed, session, ASSIGNED)
-    elif len(parts) == 4 and parts[1] == "trials" and (parts[3].endswith(_END) or _PIECE.fullmatch(parts[3])):
-        if found := _recording(listed, session, parts[2], parts[3]):
-            return found
-        why = "no recording has that name"
-    return Item(KeyKind.FOREIGN, listed, session, why=why)
-
-
-def _recording(listed: Listed, user: str, server: str, name: str) -> Item | None:
-    piece = _PIECE.fullmatch(name)
-    found = piece or _RECORDING.fullmatch(name.removesuffix(_END))
-    if not found or not SERVER_NAME.fullmatch(server):
-        return None
-    return Item(KeyKind.TAPE if piece else KeyKind.RECORDING, listed, user, found["step"], server, found[0])
+    match parts:
+        case [*_, name] if name.endswith((".part", ".new")):
+            why = "it was still being written"
+        case [name] if name in own:
+            return Item(own[name][0], listed, owner, own[name][1])
+        case ["answers", name] if name.endswith(".json") and not in_sessions:
+            step, dot, number = name.removesuffix(".json").partition(".")
+            if NAME.fullmatch(step) and step not in RESERVED and (not dot or _TRY.fullmatch(number)):
+                return Item(KeyKind.ANSWER, listed, owner, f"{step}{dot}{number}")
+            why = "no step can have that name"
+        case ["trials", server, name] if name.endswith(_END) or _PIECE.fullmatch(name):
+            piece = _PIECE.fullmatch(name)
+            found = piece or _RECORDING.fullmatch(name.removesuffix(_END))
+            if found and SERVER_NAME.fullmatch(server):
+                kind = KeyKind.TAPE if piece else KeyKind.RECORDING
+                return Item(kind, listed, owner, found["step"], server, found[0])
+            why = "no recording has that name"
+    return Item(KeyKind.FOREIGN, listed, owner, why=why)
 
 
 def attempt(project: str, user: str, server: str) -> int | None:

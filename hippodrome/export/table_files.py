@@ -33,6 +33,11 @@ class Column(NamedTuple):
     type: str = "text"
 
 
+def as_columns(names: str) -> tuple[Column, ...]:
+    """Return columns with these names; after a colon stands the type of one that has no texts."""
+    return tuple(Column(*name.split(":")) for name in names.split())
+
+
 @dataclass
 class Style:
     """The formats of tables. With `spreadsheet`, an apostrophe stands before each cell that a spreadsheet would run as

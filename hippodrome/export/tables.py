@@ -5,23 +5,22 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from hippodrome.export import scrub
 from hippodrome.export.answers import Answers
+from hippodrome.export.keys import KeyKind
 from hippodrome.export.recording import MAX_FORM_COLUMNS
 from hippodrome.export.records import Record, SourceFile
 from hippodrome.export.scrub import clean
-from hippodrome.export.table_files import BATCH, Column, Table, fit
+from hippodrome.export.table_files import BATCH, Column, Table, as_columns, fit
 from hippodrome.export.values import as_number, as_text, as_whole, when
 from hippodrome.protocol.keys import sessions_folder
 from hippodrome.protocol.players import MAX_PLAYERS
-from hippodrome.protocol.session import is_session_id
 
-_SESSION = (Column("session"), Column("player"))
+_SESSION = as_columns("session player")
 
 
 class Episodes(Table):
@@ -49,18 +48,10 @@ class Episodes(Table):
     @property
     def columns(self) -> list[Column]:
         return [
-            Column("participant"),
-            Column("studyStep"),
-            Column("attempt", "whole"),
-            Column("trial"),
-            Column("episode", "whole"),
-            Column("seed", "whole"),
-            Column("frames", "whole"),
-            Column("score", "number"),
-            Column("why"),
-            Column("started", "time"),
-            Column("ended", "time"),
-            Column("file"),
+            *as_columns(
+                "participant studyStep attempt:whole trial episode:whole seed:whole frames:whole "
+                "score:number why started:time ended:time file"
+            ),
             *((*_SESSION, Column("framesByPolicy", "whole")) if self._in_sessions else ()),
             *(Column(f"player.{clean(name)}") for name in self._players),
             *(Column(f"score.{clean(name)}", "number") for name in self._players),
@@ -77,12 +68,7 @@ class Episodes(Table):
                     filled = episode["forms"].get(player or "", {})
                     yield [
                         number,
-                        episode["step"],
-                        episode["attempt"],
-                        episode["trial"],
-                        episode["episode"],
-                        episode["seed"],
-                        episode["frames"],
+                        *(episode[name] for name in ("step", "attempt", "trial", "episode", "seed", "frames")),
                         score,
                         episode["why"],
                         when(episode["started"]),
@@ -137,6 +123,11 @@ class _LinesTable(Table):
     def _rows(self, record: Record, file: SourceFile, line: Mapping[str, Any]) -> Iterator[list[Any]]:
         raise NotImplementedError
 
+    def _where(self, file: SourceFile, line: Mapping[str, Any]) -> list[Any]:
+        """The step of the study, the attempt, the trial, the episode, the step and the time of a line."""
+        first = file.episodes[0]
+        return [first["step"], first["attempt"], *(line[name] for name in ("trial", "episode", "step", "time"))]
+
 
 class Callbacks(_LinesTable):
     """A row per line that a callback of the agent has recorded.
@@ -150,19 +141,10 @@ class Callbacks(_LinesTable):
     @property
     def columns(self) -> list[Column]:
         return [
-            Column("participant"),
-            Column("studyStep"),
-            Column("attempt", "whole"),
-            Column("trial"),
-            Column("episode", "whole"),
-            Column("step", "whole"),
-            Column("time", "time"),
-            Column("callback"),
-            Column("name"),
-            Column("value"),
-            Column("error"),
-            Column("skipped", "whole"),
-            Column("file"),
+            *as_columns(
+                "participant studyStep attempt:whole trial episode:whole step:whole time:time callback "
+                "name value error skipped:whole file"
+            ),
             *(_SESSION if self._in_sessions else ()),
         ]
 
@@ -174,12 +156,7 @@ class Callbacks(_LinesTable):
         player, value = as_text(other.get("player")), other.get("value")
         yield [
             record.number or first.get("people", {}).get(player),
-            first["step"],
-            first["attempt"],
-            line["trial"],
-            line["episode"],
-            line["step"],
-            line["time"],
+            *self._where(file, line),
             as_text(other.get("callback")),
             as_text(other.get("name")),
             None if value is None else fit(value, "text"),
@@ -196,19 +173,9 @@ class Presence(_LinesTable):
 
     name = "presence"
     kinds = ("presence", "ping")
-    columns = (
-        Column("participant"),
-        Column("session"),
-        Column("player"),
-        Column("studyStep"),
-        Column("attempt", "whole"),
-        Column("trial"),
-        Column("episode", "whole"),
-        Column("step", "whole"),
-        Column("time", "time"),
-        Column("what"),
-        Column("roundTrip", "number"),
-        Column("file"),
+    columns = as_columns(
+        "participant session player studyStep attempt:whole trial episode:whole step:whole time:time what "
+        "roundTrip:number file"
     )
 
     def _has_lines(self, file: SourceFile) -> bool:
@@ -221,12 +188,7 @@ class Presence(_LinesTable):
                 first.get("people", {}).get(player),
                 first["session"],
                 clean(player),
-                first["step"],
-                first["attempt"],
-                line["trial"],
-                line["episode"],
-                line["step"],
-                line["time"],
+                *self._where(file, line),
                 what,
                 trip,
                 file.path,
@@ -261,7 +223,7 @@ class Identities(Table):
 
     @property
     def columns(self) -> list[Column]:
-        fixed = (Column("participant"), Column("userId"), Column("completionCode"))
+        fixed = as_columns("participant userId completionCode")
         return [*fixed, *(Column(clean(name)) for name in self._answers.links)]
 
     def rows(self, record: Record) -> Iterator[list[Any]]:
@@ -275,36 +237,28 @@ class Problems(Table):
     """A row for each problem with a file of the source, with its key. With `apart` the key has no ids."""
 
     name = "problems"
-    columns = (Column("participant"), Column("file"), Column("problem"))
+    columns = as_columns("participant file problem")
 
     def __init__(self, project: str, apart: bool) -> None:
         self._project, self._apart = project, apart
 
     def rows(self, record: Record) -> Iterator[list[Any]]:
         for key, file in sorted(record.files.items()):
-            shown = clean(key.removeprefix(f"{self._project}/users/"))
-            if self._apart:
-                shown = self._without_ids(record, key)
-            yield from ([record.number or None, shown, problem] for problem in file.problems)
+            shown = self._without_ids(record, file) if self._apart else key.removeprefix(f"{self._project}/users/")
+            yield from ([record.number or None, clean(shown), problem] for problem in file.problems)
 
-    def _without_ids(self, record: Record, key: str) -> str:
-        """A key without ids. A session's id stays, since it identifies nobody; unknown parts are left out."""
-        _, top, owner, *parts = [*key.split("/"), ""]
-        match parts[:-1]:
-            case [document] if document in ("participant.json", "session.json", "assignment.json", "end.json"):
-                rest = document
-            case ["answers", answer] if _ANSWER.fullmatch(answer) and answer != f"{record.user}.json":
-                rest = f"answers/{answer}"
-            case ["trials", _, recorded] if _RECORDED.fullmatch(recorded):
-                rest = f"trials/(server)/{recorded}"
-            case _:
-                rest = ""
-        if key.startswith(sessions_folder(self._project)):
-            return f"{top}/{owner}/{rest}" if rest and is_session_id(owner) else "(somewhere in sessions/)"
-        if not record.is_participant:
-            return "(somewhere in users/)"
-        return f"{record.number}/{scrub.Scrub(record.identities).text(rest or '(another file)')}"
-
-
-_ANSWER = re.compile(r"[A-Za-z0-9_-]{1,64}(\.[0-9]{1,4})?\.json")
-_RECORDED = re.compile(r"[A-Za-z0-9_-]{1,64}-(?:(?:trial|episode)[0-9-]*\.jsonl\.gz|talk-[0-9]*\.json)")
+    def _without_ids(self, record: Record, file: SourceFile) -> str:
+        """A file's key without ids. A session's id stays, since it identifies nobody; so do words of the format."""
+        if not record.user:
+            top = "sessions" if file.key.startswith(sessions_folder(self._project)) else "users"
+            return f"(somewhere in {top}/)"
+        match file.key.split("/")[3:]:
+            case _ if file.kind == KeyKind.FOREIGN:
+                shown = "(another file)"
+            case ["trials", _, name]:
+                shown = f"trials/(server)/{name}"
+            case parts:
+                shown = "/".join(parts)
+        if record.is_session:
+            return f"sessions/{record.user}/{shown}"
+        return f"{record.number}/{scrub.Scrub(record.identities).text(shown)}"

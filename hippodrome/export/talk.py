@@ -9,13 +9,13 @@ from typing import Any
 from hippodrome.export.keys import KeyKind
 from hippodrome.export.records import Record
 from hippodrome.export.scrub import Scrub, clean
-from hippodrome.export.table_files import Column, Table
+from hippodrome.export.table_files import Column, Table, as_columns
 from hippodrome.export.values import as_text, as_whole, when
 
 SCHEMA = 1
 _Said = tuple[Mapping[str, Any], datetime]
-_WHERE = (Column("participant"), Column("studyStep"), Column("attempt", "whole"))
-_WHEN = (Column("episode", "whole"), Column("step", "whole"), Column("n", "whole"))
+_WHERE = as_columns("participant studyStep attempt:whole")
+_WHEN = as_columns("episode:whole step:whole n:whole")
 
 
 def document(
@@ -78,16 +78,7 @@ class Messages(_TapeTable):
 
     name = "messages"
     kind = "line"
-    own = (
-        Column("by"),
-        Column("to"),
-        Column("time", "time"),
-        Column("text"),
-        Column("replySeconds", "number"),
-        Column("typedSeconds", "number"),
-        Column("held"),
-        Column("original"),
-    )
+    own = as_columns("by to time:time text replySeconds:number typedSeconds:number held original")
 
     def rows(self, record: Record) -> Iterator[list[Any]]:
         step = ""
@@ -134,17 +125,8 @@ class Calls(_TapeTable):
 
     name = "calls"
     kind = "call"
-    own = (
-        Column("time", "time"),
-        Column("milliseconds", "whole"),
-        Column("path"),
-        Column("model"),
-        Column("status", "whole"),
-        Column("error"),
-        Column("inputTokens", "whole"),
-        Column("outputTokens", "whole"),
-        Column("estimated"),
-        Column("hash"),
+    own = as_columns(
+        "time:time milliseconds:whole path model status:whole error inputTokens:whole outputTokens:whole estimated hash"
     )
 
     def rows(self, record: Record) -> Iterator[list[Any]]:
