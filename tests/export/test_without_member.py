@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hippodrome.export.without_member import rewrite
-from hippodrome.trial.core.recorded import RecordedTrial
+from hippodrome.trial.core.history import RecordedTrial
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.resume import add_lines
 from testing.exploration import examples

@@ -19,9 +19,9 @@ from hippodrome.trial.agent.joint import JointAdapter, start
 from hippodrome.trial.agent.joint_calls import JointCalls
 from hippodrome.trial.core import messages
 from hippodrome.trial.core.effects import Call, OpenRecording, RecordLine, ResetPolicy, SaveAnswer, WriteLine
+from hippodrome.trial.core.history import RecordedTrial
 from hippodrome.trial.core.players import Player, who_plays
 from hippodrome.trial.core.policies import AskPolicy
-from hippodrome.trial.core.recorded import RecordedTrial
 from hippodrome.trial.core.trial import Trial
 from hippodrome.trial.policies.places import load_policies
 from hippodrome.trial.recordings.recorder import rules

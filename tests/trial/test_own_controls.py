@@ -9,8 +9,8 @@ import pytest
 
 from hippodrome.protocol import trial, trial_check
 from hippodrome.trial.core import messages
+from hippodrome.trial.core.history import MessageLog, RecordedTrial, Word
 from hippodrome.trial.core.messages import BadMessage
-from hippodrome.trial.core.recorded import MessageLog, RecordedTrial, Word
 from hippodrome.trial.recordings.resume import add_lines
 from hippodrome.trial.settings import trial_section
 from hippodrome.trial.wire import plain

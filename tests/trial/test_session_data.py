@@ -15,7 +15,7 @@ from hippodrome.console.problem import Exit
 from hippodrome.control.model.records import to_json
 from hippodrome.control.model.sessions import Membership
 from hippodrome.protocol.keys import membership_key
-from hippodrome.trial.core.recorded import RecordedTrial
+from hippodrome.trial.core.history import RecordedTrial
 from hippodrome.trial.recordings.resume import add_lines
 from tests.trial.sessions import SID, form, launch_session, member, put, recordings
 from tests.trial.two_players import two_players

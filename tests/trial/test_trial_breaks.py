@@ -5,9 +5,9 @@ from itertools import groupby
 
 import pytest
 
+from hippodrome.trial.core.history import Break, Episode, RecordedTrial
 from hippodrome.trial.core.players import PLAYER, alone
 from hippodrome.trial.core.progress import PlayState, TrialProgress
-from hippodrome.trial.core.recorded import Break, Episode, RecordedTrial
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.resume import add_lines
 from hippodrome.trial.settings import trial_section

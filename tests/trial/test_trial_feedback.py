@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from hippodrome.trial.core.recorded import RecordedTrial, Word
+from hippodrome.trial.core.history import RecordedTrial, Word
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.resume import add_lines
 

@@ -14,7 +14,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from hippodrome.trial.core import messages
-from hippodrome.trial.core.recorded import MessageLog
+from hippodrome.trial.core.history import MessageLog
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.server.handshake import NEEDS_PROOF, OTHER_ID, OTHER_ORIGIN, OTHER_STUDY
 from hippodrome.trial.settings import TrialSettings

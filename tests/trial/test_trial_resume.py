@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hippodrome.trial.core.recorded import RecordedTrial, Word
+from hippodrome.trial.core.history import RecordedTrial, Word
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.resume import add_lines, load_recorded
 from hippodrome.trial.recordings.store import FolderStore

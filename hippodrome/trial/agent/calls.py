@@ -19,8 +19,8 @@ from hippodrome.trial.core.effects import (
     StepCall,
     StepTaken,
 )
+from hippodrome.trial.core.history import Episode, Word
 from hippodrome.trial.core.players import ACTION_MASK, PLAYER, View
-from hippodrome.trial.core.recorded import Episode, Word
 from hippodrome.trial.llm.ledger import Moment
 from hippodrome.trial.recordings import recording
 

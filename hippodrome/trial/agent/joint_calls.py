@@ -11,9 +11,9 @@ import numpy as np
 from hippodrome.trial.agent.calls import Calls, Diverged
 from hippodrome.trial.agent.joint import Joint, JointAdapter
 from hippodrome.trial.core.effects import Begun, ReplayCall, Replayed, ResetCall, StepCall, StepTaken
+from hippodrome.trial.core.history import UnfinishedEpisode, Word
 from hippodrome.trial.core.players import Action, Player, View, policy_seed
 from hippodrome.trial.core.policies import Observed
-from hippodrome.trial.core.recorded import UnfinishedEpisode, Word
 from hippodrome.trial.recordings import recording
 
 _NONE: frozenset[str] = frozenset()

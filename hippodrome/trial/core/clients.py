@@ -11,10 +11,10 @@ from hippodrome.protocol.trial import TrialSection
 from hippodrome.trial.core import messages
 from hippodrome.trial.core.controls import ARROWS, KEY
 from hippodrome.trial.core.effects import Close, Effect, Pictures, SendMessage, SendPicture, SendState, SendTalk
+from hippodrome.trial.core.history import MessageLog
 from hippodrome.trial.core.messages import CommandRefused, Message
 from hippodrome.trial.core.participants import Alone, Participants
 from hippodrome.trial.core.progress import TrialProgress
-from hippodrome.trial.core.recorded import MessageLog
 from hippodrome.trial.core.talk import Talk
 from hippodrome.trial.core.timing import StateTimes, Timing, Window
 

@@ -12,9 +12,9 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
+from hippodrome.trial.core.history import Break, Episode, UnfinishedEpisode, Word
 from hippodrome.trial.core.players import Action, Player, View
 from hippodrome.trial.core.policies import AskPolicy, Observed
-from hippodrome.trial.core.recorded import Break, Episode, UnfinishedEpisode, Word
 from hippodrome.trial.pictures.reader import Picture
 
 Pictures = Picture | dict[str, Picture]

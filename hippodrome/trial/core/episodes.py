@@ -27,11 +27,11 @@ from hippodrome.trial.core.effects import (
     WriteLine,
     WriteLog,
 )
+from hippodrome.trial.core.history import Break, Episode, MessageLog, UnfinishedEpisode
 from hippodrome.trial.core.participants import Participants
 from hippodrome.trial.core.players import View, policy_seed
 from hippodrome.trial.core.policies import Observed
 from hippodrome.trial.core.progress import TrialProgress
-from hippodrome.trial.core.recorded import Break, Episode, MessageLog, UnfinishedEpisode
 from hippodrome.trial.core.records import Recordings
 from hippodrome.trial.core.timing import Timing
 from hippodrome.trial.settings import TrialSettings

@@ -10,8 +10,8 @@ from enum import Enum
 
 from hippodrome.protocol.trial import TrialSection
 from hippodrome.trial.core.choices import Choices
+from hippodrome.trial.core.history import PARTNER_LEFT, Break, Episode
 from hippodrome.trial.core.players import Action, Player
-from hippodrome.trial.core.recorded import PARTNER_LEFT, Break, Episode
 
 FAILURES_ALLOWED = 3
 """The trial ends as failed after so many failures of the researcher's code without an episode that ended by itself."""

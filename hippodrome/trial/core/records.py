@@ -9,9 +9,9 @@ from typing import Any
 
 from hippodrome.trial.core import messages
 from hippodrome.trial.core.effects import CloseRecording, Effect, LogAgentError, OpenRecording, RecordLine, WriteLog
+from hippodrome.trial.core.history import Break, Episode
 from hippodrome.trial.core.policies import FAILURES
 from hippodrome.trial.core.progress import TrialProgress
-from hippodrome.trial.core.recorded import Break, Episode
 
 
 def end(

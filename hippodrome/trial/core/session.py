@@ -14,12 +14,12 @@ from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import Any
 
 from hippodrome.protocol.trial import TrialSection as Config
-from hippodrome.trial.core import messages, recorded, records
+from hippodrome.trial.core import history, messages, records
 from hippodrome.trial.core.effects import Effect, RecordLine, ResetPolicy, SaveAnswer, SaveMember, WriteLog
+from hippodrome.trial.core.history import RecordedTrial
 from hippodrome.trial.core.players import policy_seed
 from hippodrome.trial.core.presence import Presence, Rules
 from hippodrome.trial.core.progress import TrialProgress
-from hippodrome.trial.core.recorded import RecordedTrial
 from hippodrome.trial.core.records import Recordings
 from hippodrome.trial.core.timing import Window
 
@@ -358,7 +358,7 @@ class TrialSession:
         if over is not None:
             return "left" if over == "absent" else "ping"
         stopped_by_another = outcome == "stopped" and self._stopped and player not in self._stopped
-        return recorded.PARTNER_LEFT if stopped_by_another else outcome
+        return history.PARTNER_LEFT if stopped_by_another else outcome
 
     def reset_fields(self) -> dict[str, Any]:
         """Return further fields for the line of a reset: round trips, and the players whose members are replaced."""
@@ -415,8 +415,8 @@ class TrialSession:
             return PING
         if not self._progress.over:
             return None
-        if self._progress.outcome == "stopped" and self._outcome(player) == recorded.PARTNER_LEFT:
+        if self._progress.outcome == "stopped" and self._outcome(player) == history.PARTNER_LEFT:
             return PARTNER_STOPPED
-        if self._progress.outcome != recorded.PARTNER_LEFT:
+        if self._progress.outcome != history.PARTNER_LEFT:
             return None
         return LEFT if over == "absent" else PARTNER_LEFT if self._begun else PARTNER_MISSING

@@ -32,7 +32,7 @@ This module decides what comes next, and passes each event to the part that it c
   episodes                               how an episode begins (also one of an earlier server), goes on and ends; which
                                          call the agent has now, one at a time
   talk                                   who says what to whom
-  recorded, records                      what is recorded, and what the answer holds
+  history, records                       what has happened, what is recorded of it, and what the answer holds
   clients, messages                      what is sent to clients; what they may ask for, and why it is refused
 
 A player is a place of the environment (`hippodrome/trial/core/players.py`): a human plays it, or a policy. Each
@@ -60,10 +60,10 @@ from hippodrome.trial.core.effects import (
     WriteLog,
 )
 from hippodrome.trial.core.episodes import LAST_CALL_SECONDS, AgentCall, Episodes
+from hippodrome.trial.core.history import MessageLog, RecordedTrial
 from hippodrome.trial.core.participants import Alone, Participants
 from hippodrome.trial.core.players import Player, alone
 from hippodrome.trial.core.progress import TrialProgress
-from hippodrome.trial.core.recorded import MessageLog, RecordedTrial
 from hippodrome.trial.core.records import Recordings, words_of
 from hippodrome.trial.core.session import TrialSession
 from hippodrome.trial.core.talk import Talk

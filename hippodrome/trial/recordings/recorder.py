@@ -17,8 +17,8 @@ from hippodrome.protocol.answer import GAME, Answer, answers_in, to_json
 from hippodrome.protocol.keys import answer_key, with_number
 from hippodrome.protocol.trial import TrialSection
 from hippodrome.trial.core.effects import OpenRecording
+from hippodrome.trial.core.history import RecordedTrial
 from hippodrome.trial.core.players import Player
-from hippodrome.trial.core.recorded import RecordedTrial
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.recording import Recording
 from hippodrome.trial.recordings.resume import load_recorded

@@ -14,8 +14,7 @@ from dataclasses import replace
 from itertools import count
 from typing import Any
 
-from hippodrome.trial.core.messages import is_feedback
-from hippodrome.trial.core.recorded import (
+from hippodrome.trial.core.history import (
     PARTNER_LEFT,
     Episode,
     RecordedAction,
@@ -24,6 +23,7 @@ from hippodrome.trial.core.recorded import (
     UnfinishedEpisode,
     Word,
 )
+from hippodrome.trial.core.messages import is_feedback
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.store import Store
 

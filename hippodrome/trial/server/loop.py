@@ -47,10 +47,10 @@ from hippodrome.trial.core.effects import (
     WriteLine,
     WriteLog,
 )
+from hippodrome.trial.core.history import RecordedTrial
 from hippodrome.trial.core.messages import Message
 from hippodrome.trial.core.players import Player, PlayersError
 from hippodrome.trial.core.policies import AskPolicy
-from hippodrome.trial.core.recorded import RecordedTrial
 from hippodrome.trial.core.trial import Trial
 from hippodrome.trial.llm.client import ModelError
 from hippodrome.trial.llm.endpoint import Endpoint, Game

@@ -23,9 +23,9 @@ from hippodrome.trial.core.effects import (
     WriteLine,
     WriteLog,
 )
+from hippodrome.trial.core.history import Word
 from hippodrome.trial.core.players import PLAYER, alone
 from hippodrome.trial.core.progress import PlayState
-from hippodrome.trial.core.recorded import Word
 from hippodrome.trial.core.timing import Window
 from hippodrome.trial.core.trial import TRIAL_FAILED, Phase
 from hippodrome.trial.settings import STALLED_SECONDS
@@ -367,7 +367,7 @@ def test_feedback_goes_to_the_agent_with_the_next_step_once():
 
 
 def test_too_many_messages_between_two_steps_are_counted_and_not_kept(monkeypatch):
-    monkeypatch.setattr("hippodrome.trial.core.recorded.MESSAGES_KEPT", 3)
+    monkeypatch.setattr("hippodrome.trial.core.history.MESSAGES_KEPT", 3)
     driver = Driver().playing()
     driver.step()
     for _ in range(5):

@@ -22,8 +22,8 @@ from hippodrome.trial.core.effects import (
     WriteLine,
     WriteLog,
 )
+from hippodrome.trial.core.history import Break, Episode, RecordedTrial, UnfinishedEpisode, Word
 from hippodrome.trial.core.players import PLAYER, alone
-from hippodrome.trial.core.recorded import Break, Episode, RecordedTrial, UnfinishedEpisode, Word
 from hippodrome.trial.core.trial import TRIAL_FAILED, Phase
 from tests.trial.core.trial_driver import FRAME, SPACE, STEPS, Driver, recorded, sent
 

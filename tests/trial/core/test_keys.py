@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hippodrome.trial.core import messages
 from hippodrome.trial.core.controls import KEY, Controls
 from hippodrome.trial.core.effects import RecordLine, SendMessage, SendState, StepCall
-from hippodrome.trial.core.recorded import Episode, RecordedTrial
+from hippodrome.trial.core.history import Episode, RecordedTrial
 from hippodrome.trial.core.timing import EpisodeTime
 from hippodrome.trial.recordings.resume import add_lines
 from tests.trial.core.trial_driver import Driver

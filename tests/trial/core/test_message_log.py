@@ -3,7 +3,7 @@
 import json
 
 from hippodrome.trial.core import messages
-from hippodrome.trial.core.recorded import FIELDS_KEPT, FIELDS_WAITING, MESSAGES_KEPT, MessageLog, Word
+from hippodrome.trial.core.history import FIELDS_KEPT, FIELDS_WAITING, MESSAGES_KEPT, MessageLog, Word
 
 
 def test_all_unknown_fields_of_a_trial_are_bounded():
@@ -78,7 +78,7 @@ def test_five_thousand_messages_of_a_participant_wait_for_a_line_and_more_are_dr
 
 
 def test_each_member_of_a_session_has_room_for_their_own_messages(monkeypatch):
-    monkeypatch.setattr("hippodrome.trial.core.recorded.MESSAGES_KEPT", 3)
+    monkeypatch.setattr("hippodrome.trial.core.history.MESSAGES_KEPT", 3)
     log = MessageLog()
     for player in ("left",) * 5 + ("right",) * 4:
         log.add(messages.Message(command="bad"), 0, player)

@@ -3,10 +3,10 @@
 import pytest
 
 from hippodrome.trial.core.controls import Controls
+from hippodrome.trial.core.history import Break, Episode
 from hippodrome.trial.core.messages import CommandRefused
 from hippodrome.trial.core.players import PLAYER, Action, Player, alone
 from hippodrome.trial.core.progress import PlayState, TrialProgress
-from hippodrome.trial.core.recorded import Break, Episode
 from hippodrome.trial.core.timing import Pacer
 from hippodrome.trial.settings import trial_section
 

@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hippodrome.trial.core.history import Break, Episode
 from hippodrome.trial.core.messages import CommandRefused
 from hippodrome.trial.core.players import PLAYER, alone
 from hippodrome.trial.core.progress import PlayState, TrialProgress
-from hippodrome.trial.core.recorded import Break, Episode
 from hippodrome.trial.core.timing import Pacer
 from hippodrome.trial.settings import trial_section
 

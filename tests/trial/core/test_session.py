@@ -8,8 +8,8 @@ import pytest
 
 from hippodrome.trial.core import messages
 from hippodrome.trial.core.effects import AskPolicy, RecordLine, ResetCall, ResetPolicy, SaveMember, SendDone, WriteLog
+from hippodrome.trial.core.history import MESSAGES_KEPT, RecordedTrial
 from hippodrome.trial.core.players import policy_seed
-from hippodrome.trial.core.recorded import MESSAGES_KEPT, RecordedTrial
 from hippodrome.trial.core.session import LEFT, PARTNER_LEFT, PARTNER_MISSING, PARTNER_STOPPED, PING
 from hippodrome.trial.core.timing import Window
 from hippodrome.trial.core.trial import TRIAL_FAILED, Trial

@@ -29,10 +29,10 @@ from hippodrome.trial.core.effects import (
     StepTaken,
     WriteLog,
 )
+from hippodrome.trial.core.history import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
 from hippodrome.trial.core.messages import CommandRefused
 from hippodrome.trial.core.players import PLAYER, Player, PlayersError, View, alone, policy_seed, who_plays
 from hippodrome.trial.core.policies import AskPolicy, Observed
-from hippodrome.trial.core.recorded import RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode
 from hippodrome.trial.core.timing import Window
 from hippodrome.trial.core.trial import Phase, Trial
 from hippodrome.trial.settings import TrialSettings, trial_section

@@ -15,8 +15,8 @@ from hippodrome.trial.core.effects import (
     StepCall,
     StepTaken,
 )
+from hippodrome.trial.core.history import Episode, RecordedStep, RecordedTrial, UnfinishedEpisode
 from hippodrome.trial.core.players import PLAYER, alone
-from hippodrome.trial.core.recorded import Episode, RecordedStep, RecordedTrial, UnfinishedEpisode
 from hippodrome.trial.core.timing import Window
 from hippodrome.trial.core.trial import Trial
 from hippodrome.trial.settings import TrialSettings

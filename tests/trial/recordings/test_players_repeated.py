@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hippodrome.trial.core.recorded import RecordedTrial
+from hippodrome.trial.core.history import RecordedTrial
 from hippodrome.trial.core.timing import Window
 from testing.exploration import examples
 from tests.trial import repeated

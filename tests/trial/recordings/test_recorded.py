@@ -15,7 +15,7 @@ import attrs
 import numpy as np
 import pytest
 
-from hippodrome.trial.core.recorded import Episode, RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode, Word
+from hippodrome.trial.core.history import Episode, RecordedAction, RecordedStep, RecordedTrial, UnfinishedEpisode, Word
 from hippodrome.trial.recordings import recording
 from hippodrome.trial.recordings.resume import add_lines, load_recorded
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from hippodrome.protocol.session import Member
 from hippodrome.trial.core.effects import ResetPolicy
-from hippodrome.trial.core.recorded import RecordedTrial
+from hippodrome.trial.core.history import RecordedTrial
 from hippodrome.trial.core.timing import Window
 from hippodrome.trial.settings import TrialSettings
 from testing.exploration import examples

@@ -1,4 +1,4 @@
-"""What is recorded of a game step: participants' messages, episodes and breaks, and what earlier servers played. Pure.
+"""What has happened in a game step: participants' messages, episodes and breaks, and what earlier servers played. Pure.
 
 `MessageLog` keeps messages until a line of the recording holds them. `hippodrome/trial/recordings/resume.py` reads a
 `RecordedTrial`.
