@@ -6,7 +6,7 @@ If a part cannot be read (a missing permission, AWS is busy), it stays empty, an
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -198,18 +198,16 @@ class InstallationMonitor:
             look.problems["records of servers"] = f"{count(self._records.unreadable, 'record')} cannot be read; {ASK}"
         look.servers = sorted((r for r in records if not r.is_closed), key=lambda r: r.requested)
         look.recent = records
-        look.members = dict(self._members([server for server in look.servers if server.is_of_session]))
+        look.members = {r.name: size for r in look.servers if r.is_of_session and (size := self._size_of_session(r))}
 
-    def _members(self, servers: Sequence[Server]) -> Iterable[tuple[str, int]]:
-        """Yield the names of sessions' servers, each with the number of members. Reads each formed session once."""
-        for server in servers:
-            formed = self._formed.get(server.user_id)
-            if formed is None:
-                session = readable_session(self._repository, server.project_id, server.user_id)
-                formed = len(session.members) if session else None
-            if formed is not None:
-                self._formed[server.user_id] = formed
-                yield server.name, formed
+    def _size_of_session(self, server: Server) -> int | None:
+        """Return how many members the session of this server has, which never changes; None if it is not formed yet."""
+        if server.user_id not in self._formed:
+            session = readable_session(self._repository, server.project_id, server.user_id)
+            if session is None:
+                return None
+            self._formed[server.user_id] = len(session.members)
+        return self._formed[server.user_id]
 
     def _tasks(self, look: Snapshot) -> None:
         look.tasks = self._platform.tasks.count()
@@ -222,7 +220,8 @@ class InstallationMonitor:
             look.certificate = certificate(self._installation, self._platform.documents, look.at)
 
     def _alarms(self, look: Snapshot) -> None:
-        look.alarms = [alarm["AlarmName"] for alarm in alarms(self._account, self._installation) if _fires(alarm)]
+        all_alarms = alarms(self._account, self._installation)
+        look.alarms = [alarm["AlarmName"] for alarm in all_alarms if alarm["StateValue"] == "ALARM"]
 
 
 def midnight(now: datetime) -> datetime:
@@ -292,7 +291,3 @@ def subscriptions(account: Account, installation: Installation) -> Iterable[Mapp
     pages = account.client("sns").get_paginator("list_subscriptions_by_topic")
     for page in pages.paginate(TopicArn=installation["Alarms"]):
         yield from page["Subscriptions"]
-
-
-def _fires(alarm: Mapping[str, Any]) -> bool:
-    return alarm.get("StateValue") == "ALARM"

@@ -181,21 +181,18 @@ def _server(server: Server, look: Snapshot) -> Mapping[str, Any]:
 def picture(look: Snapshot, installation: Installation) -> RenderableType:
     """Draw the snapshot as tables and lines."""
     parts: list[RenderableType] = [
-        Text(f"{installation.stack} in {installation.region}, {look.at:%Y-%m-%d %H:%M:%S} UTC  {installation['Site']}")
+        _line(f"{installation.stack} in {installation.region}, {look.at:%Y-%m-%d %H:%M:%S} UTC  {installation['Site']}")
     ]
     if installation.status not in states.COMPLETE:
-        parts.append(Text(f"! The stack is in {installation.status}.", style="yellow"))
-    parts += [
-        Text(""),
-        *_projects(look),
-        Text(""),
-        *_servers(look),
-        *_failures(look),
-        Text(""),
-        *_parts(look, installation.has_domain),
-    ]
-    parts += [Text(f"! No {part}: {why}", style="yellow") for part, why in look.problems.items()]
+        parts.append(_line(f"! The stack is in {installation.status}.", "yellow"))
+    for part in (_projects(look), _servers(look), _failures(look), _others(look, installation.has_domain)):
+        parts += [Text(""), *part] if part else []
+    parts += [_line(f"! No {part}: {why}", "yellow") for part, why in look.problems.items()]
     return Group(*parts)
+
+
+def _line(text: str, style: str = "") -> Text:
+    return Text(as_typed(text), style=style)
 
 
 def _table(*columns: str) -> Table:
@@ -209,27 +206,20 @@ def _projects(look: Snapshot) -> list[RenderableType]:
     if "projects" in look.problems:
         return []
     if not look.projects:
-        return [Text(as_typed("No project is registered yet: `hippodrome register` does it."))]
+        return [_line("No project is registered yet: `hippodrome register` does it.")]
     table = _table("project", "live", "participants", "today", "finished", "where they are")
     for project, counts in look.projects:
-        where = ", ".join(
-            f"{step.key} {step.page}: {counts.by_step[step.key]:,}"
-            for step in project.steps[:-1]
-            if counts.by_step[step.key]
-        )
+        here = [(step, counts.by_step[step.key]) for step in project.steps[:-1]]
+        limit = f" of {project.max_participants:,}" if project.max_participants is not None else ""
         table.add_row(
-            Text(project.id),
+            project.id,
             Text("live", style="green") if project.live else Text("closed", style="dim"),
-            Text(_of(counts.participants, project.max_participants)),
-            Text(f"{counts.arrived_today:,}"),
-            Text(f"{counts.finished:,}"),
-            Text(where),
+            f"{counts.participants:,}{limit}",
+            f"{counts.arrived_today:,}",
+            f"{counts.finished:,}",
+            Text(", ".join(f"{step.key} {step.page}: {number:,}" for step, number in here if number)),
         )
     return [table]
-
-
-def _of(count: int, limit: int | None) -> str:
-    return f"{count:,}" if limit is None else f"{count:,} of {limit:,}"
 
 
 def _servers(look: Snapshot) -> list[RenderableType]:
@@ -237,52 +227,49 @@ def _servers(look: Snapshot) -> list[RenderableType]:
         return []
     by_state = Counter(str(server.state) for server in look.servers)
     counts = ", ".join(f"{count:,} {state}" for state, count in sorted(by_state.items())) or "none"
-    waiting = sum(server.is_warm_server for server in look.servers)
-    counts += f", {waiting:,} of them warm" if waiting else ""
+    warm = sum(server.is_warm_server for server in look.servers)
+    counts += f", {warm:,} of them warm" if warm else ""
     sessions = sum(server.is_of_session for server in look.servers)
-    members = sum(look.members.values())
-    counts += f", {sessions:,} of sessions with {count(members, 'member')}" if sessions else ""
+    members = count(sum(look.members.values()), "member")
+    counts += f", {sessions:,} of sessions with {members}" if sessions else ""
     tasks = "" if look.tasks is None else f" ({look.tasks:,} tasks on ECS)"
-    closed = ", ".join(f"{count:,} {reason}" for reason, count in look.closed_today.most_common())
+    closed = ", ".join(f"{number:,} {reason}" for reason, number in look.closed_today.most_common())
     parts: list[RenderableType] = [
-        Text(f"Servers: {counts}{tasks}." + (f" Closed today: {closed}." if closed else ""), style="bold")
+        _line(f"Servers: {counts}{tasks}." + (f" Closed today: {closed}." if closed else ""), "bold"),
+        *_warm_lines(look),
     ]
-    parts += _warm_lines(look)
     if look.servers:
         table = _table("server", "project", "state", "age", "left", "")
         for server in look.servers[:MAX_SERVERS]:
-            seconds_left = (server.deadline - look.at).total_seconds()
+            left = (server.deadline - look.at).total_seconds()
             table.add_row(
-                Text(server.name),
-                Text(server.project_id),
-                Text(str(server.state)),
-                Text(duration((look.at - server.requested).total_seconds())),
-                Text(
-                    duration(seconds_left) if seconds_left >= 0 else "overdue", style="" if seconds_left >= 0 else "red"
-                ),
+                server.name,
+                server.project_id,
+                str(server.state),
+                duration((look.at - server.requested).total_seconds()),
+                duration(left) if left >= 0 else Text("overdue", style="red"),
                 Text(_kind(server, look.members.get(server.name)), style="dim"),
             )
         parts.append(table)
     if len(look.servers) > MAX_SERVERS:
-        parts.append(Text(f"… and {len(look.servers) - MAX_SERVERS:,} more (--json has them all).", style="dim"))
+        parts.append(_line(f"… and {len(look.servers) - MAX_SERVERS:,} more (--json has them all).", "dim"))
     spent = look.spent.usd
     cost = f"Today's servers: about ${spent.likely:,.2f} (${spent.low:,.2f} to ${spent.high:,.2f}), list prices."
-    return [*parts, Text(cost)]
+    return [*parts, _line(cost)]
 
 
 def _failures(look: Snapshot) -> list[RenderableType]:
     """Tell why servers have failed in the last 24 hours. Failures that only AWS can prevent share a line."""
     lines: list[RenderableType] = []
-    of_aws = [failure for failure in look.failures if not failure.matters]
     for failure in look.failures:
         if failure.matters:
             number = count(failure.servers, "server")
             text = f"! {failure.project}: {number} failed, the last {failure.last:%H:%M} UTC ({failure.server}). "
-            lines.append(Text(as_typed(text + failure.cause.sentence), style="red"))
+            lines.append(_line(text + failure.cause.sentence, "red"))
+    of_aws = ", ".join(f"{f.servers:,} {f.cause} ({f.project})" for f in look.failures if not f.matters)
     if of_aws:
-        counts = ", ".join(f"{failure.servers:,} {failure.cause} ({failure.project})" for failure in of_aws)
-        lines.append(Text(f"Lost in the last 24 hours by no fault of yours, and replaced where AWS could: {counts}."))
-    return [Text(""), *lines] if lines else []
+        lines.append(_line(f"Lost in the last 24 hours by no fault of yours, and replaced where AWS could: {of_aws}."))
+    return lines
 
 
 def _warm_lines(look: Snapshot) -> list[RenderableType]:
@@ -291,11 +278,10 @@ def _warm_lines(look: Snapshot) -> list[RenderableType]:
     for project, _ in look.projects:
         warm = _warm(look, project)
         if warm["wanted"]:
-            text = f"{project.id}: {warm['ready']} of {warm['wanted']} warm servers ready"
-            assigned = f"; {warm['assignedToday']:,} assigned today." if warm["assignedToday"] else "."
-            lines.append(Text(text + assigned))
+            assigned = f"; {warm['assignedToday']:,} assigned today" if warm["assignedToday"] else ""
+            lines.append(_line(f"{project.id}: {warm['ready']} of {warm['wanted']} warm servers ready{assigned}."))
         elif warm["there"]:
-            lines.append(Text(f"{project.id}: {count(warm['there'], 'warm server')} on the way out."))
+            lines.append(_line(f"{project.id}: {count(warm['there'], 'warm server')} on the way out."))
     return lines
 
 
@@ -308,39 +294,28 @@ def _kind(server: Server, members: int | None) -> str:
     return kind if server.attempt == 1 else f"{kind}, attempt {server.attempt}"
 
 
-def _parts(look: Snapshot, has_domain: bool) -> list[RenderableType]:
-    """Draw the parts on queues, certificate and alarms."""
-    parts: list[RenderableType] = []
-    dead = sum(queue.waiting for queue in look.queues if queue.dead)
-    waiting = [f"{q.name} {q.waiting + q.in_flight:,}" for q in look.queues if not q.dead and q.waiting + q.in_flight]
+def _others(look: Snapshot, has_domain: bool) -> list[RenderableType]:
+    """Draw the lines on queues, certificate and alarms."""
+    lines: list[RenderableType] = []
     if "queues" not in look.problems:
-        parts.append(Text(f"Queues: {', '.join(waiting) or 'empty'}."))
-    if dead:
+        waiting = [f"{q.name} {number:,}" for q in look.queues if not q.dead and (number := q.waiting + q.in_flight)]
+        lines.append(_line(f"Queues: {', '.join(waiting) or 'empty'}."))
+    if dead := sum(queue.waiting for queue in look.queues if queue.dead):
         messages = "message could" if dead == 1 else "messages could"
-        parts.append(
-            Text(
-                as_typed(f"! {dead:,} {messages} not be dealt with: `hippodrome logs --all --errors` says why."),
-                style="red",
-            )
+        lines.append(
+            _line(f"! {dead:,} {messages} not be dealt with: `hippodrome logs --all --errors` says why.", "red")
         )
-    certificate = look.certificate
-    if certificate is not None:
+    if certificate := look.certificate:
         text = f"Certificate: {certificate.days_left} days left ({', '.join(certificate.names)})."
         bad = certificate.overdue(look.at) or certificate.staging
-        parts.append(
-            Text(text + (" STAGING: browsers refuse it." if certificate.staging else ""), "red" if bad else "")
+        lines.append(
+            _line(text + (" STAGING: browsers refuse it." if certificate.staging else ""), "red" if bad else "")
         )
     elif "certificate" not in look.problems and has_domain:
-        parts.append(
-            Text(
-                as_typed(
-                    "! No certificate: servers cannot be reached. `hippodrome certificate --production` orders one."
-                ),
-                style="red",
-            )
-        )
+        order = "`hippodrome certificate --production` orders one."
+        lines.append(_line(f"! No certificate: servers cannot be reached. {order}", "red"))
     if look.alarms:
-        parts.append(Text(f"! Alarms: {', '.join(sorted(look.alarms))}.", style="red"))
+        lines.append(_line(f"! Alarms: {', '.join(sorted(look.alarms))}.", "red"))
     elif "alarms" not in look.problems:
-        parts.append(Text("Alarms: none fires."))
-    return parts
+        lines.append(_line("Alarms: none fires."))
+    return lines
