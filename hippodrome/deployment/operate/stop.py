@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -72,17 +72,9 @@ class Stopper:
         self._scope = scope
         self._executor = executor or Executor()
         self._termination = Termination(ServerServices(platform))
-        self._records = Records(platform.documents)
+        self.records = Records(platform.documents)
         self.errors: dict[str, None] = {}  # sentences, each once
         self.stopped: set[str] = set()  # names of servers that were stopped
-
-    @property
-    def unreadable(self) -> int:
-        """The number of servers' records that cannot be read.
-
-        Resources of these servers count as owned by no server.
-        """
-        return self._records.unreadable
 
     def run(self, wait: float, advance: Callable[[int], None] = lambda _: None) -> FoundServers:
         """Stop servers until a look finds nothing, or `wait` seconds are over. Return what the last look found."""
@@ -99,7 +91,7 @@ class Stopper:
         found = resources.list_resources(platform)
         theirs = filter(self._scope.erases, found.clusters)
         draining = list(platform.tasks.draining(found.cluster, *theirs))
-        owners = self._records.owners([*found.names(), *(task.name for task in draining)])
+        owners = self.records.owners([*found.names(), *(task.name for task in draining)])
         by_label = {record.label: record for record in owners.values()}
         for record in self._open():
             by_label.setdefault(record.label, record)
@@ -114,8 +106,8 @@ class Stopper:
 
     def _open(self) -> Iterable[Server]:
         if self._scope.labels:
-            return self._records.read(self._scope.labels).values()
-        return self._records.open(self._platform.settings.max_runtime, self._platform.now())
+            return self.records.read(self._scope.labels).values()
+        return self.records.open(self._platform.settings.max_runtime, self._platform.now())
 
     def _covers(self, name: str, owner: Server | None) -> bool:
         return self._scope.erases(name) if self._scope.labels else self._scope.covers(owner)
@@ -199,13 +191,14 @@ def command(
             {"stopped": len(stopper.stopped), "left": remaining.counts(), "errors": list(stopper.errors)}
         )
     if remaining.to_do:
+        left = ", ".join(f"{count:,} {what}" for what, count in remaining.counts().items() if count)
         raise Problem(
-            f"Not everything is gone: {_in_words(remaining.counts())}.",
+            f"Not everything is gone: {left}.",
             "Run it again: it goes on from there. Every server's own timer stops it too.",
             list(stopper.errors),
         )
-    if stopper.unreadable:
-        unread = count(stopper.unreadable, "record")
+    if stopper.records.unreadable:  # resources of these servers count as owned by no server
+        unread = count(stopper.records.unreadable, "record")
         screen.warning(f"{unread} of servers cannot be read; `hippodrome doctor --all` names them.")
     stopped = count(len(stopper.stopped), "server") + (" was" if len(stopper.stopped) == 1 else " were")
     screen.success(f"{stopped} stopped; nothing is left." if stopper.stopped else "Nothing runs.")
@@ -225,32 +218,27 @@ def _again(live: Sequence[Project]) -> str:
     return text + (f", and {', '.join(warm)} will have warm ones again within five minutes" if warm else "")
 
 
-def _show(servers: FoundServers, as_json: bool) -> None:
+def _show(found: FoundServers, as_json: bool) -> None:
     if as_json:
-        screen.result_json({"found": servers.counts(), "servers": [_line(record) for record in servers.servers]})
+        servers = [
+            {
+                "server": record.name,
+                "project": record.project_id,
+                "state": record.state,
+                "warm": record.is_warm_server,
+                "since": record.requested,
+            }
+            for record in found.servers
+        ]
+        screen.result_json({"found": found.counts(), "servers": servers})
         return
-    projects = Counter((record.project_id, _state(record)) for record in servers.servers)
+    projects = Counter(
+        (record.project_id, f"{record.state}, warm" if record.is_warm_server else str(record.state))
+        for record in found.servers
+    )
     rows = [(project, state, count) for (project, state), count in sorted(projects.items())]
-    rows += [("left over", what, count) for what, count in servers.counts().items() if count and what != "servers"]
+    rows += [("left over", what, count) for what, count in found.counts().items() if count and what != "servers"]
     if rows:
         screen.table(["project", "state", "servers"], rows, right=["servers"])
     else:
         screen.info("Nothing runs.")
-
-
-def _state(record: Server) -> str:
-    return f"{record.state}, warm" if record.is_warm_server else str(record.state)
-
-
-def _line(record: Server) -> Mapping[str, Any]:
-    return {
-        "server": record.name,
-        "project": record.project_id,
-        "state": record.state,
-        "warm": record.is_warm_server,
-        "since": record.requested,
-    }
-
-
-def _in_words(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)

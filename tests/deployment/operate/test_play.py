@@ -201,6 +201,16 @@ def test_ctrl_c_during_the_rehearsal_removes_everything(
     assert "data" not in told["proven"]
 
 
+def test_a_closed_terminal_while_a_server_is_being_asked_for_leaves_nothing(
+    running: RunningInstallation, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Play, "_site", lambda _: os.kill(os.getpid(), signal.SIGHUP))
+    ran = play(running, capsys)
+    assert ran.code == Exit.INTERRUPTED
+    assert "✓ erased: The copy and the bots' data are gone" in ran.err
+    assert_nothing_left(running)
+
+
 def doctors_context() -> CheckContext:
     account = account_here()
     return CheckContext(account, find_installation(account), 20, datetime.now(UTC))
@@ -218,7 +228,8 @@ def test_a_rehearsal_that_was_killed_is_removed_by_the_next(running: RunningInst
     assert left_behind(context, now + timedelta(hours=3)) == [copy.id]
     unregister(context.platform.documents, copy.id)  # the removal was killed, too
     assert left_behind(context, now + timedelta(hours=3)) == [copy.id]
-    assert StudyCopy(context, copy.id).remove() > 5
+    deleted, servers = StudyCopy(context, copy.id).remove()
+    assert (deleted > 5, len(servers)) == (True, 2)
     assert left_behind(context, now + timedelta(hours=3)) == []
     assert_nothing_left(running)
 

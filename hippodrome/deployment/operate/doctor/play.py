@@ -124,7 +124,6 @@ class Play:
                 part("sweep", lambda: self._sweep(lone.record))
                 part("alarm", self._alarm)
         finally:
-            part("cost", self._cost)
             part("erased", self._remove)
 
     # The copy
@@ -147,15 +146,14 @@ class Play:
         return f"A copy of a registered study, with {pages} pages of its own, was registered."
 
     def _remove(self) -> str:
-        deleted = self._copy.remove(self._progress)
-        return f"The copy and the bots' data are gone, {deleted} versions of documents in all."
-
-    def _cost(self) -> str:
-        total = spent(self._copy.records(), datetime.now(UTC))
-        text = (
+        deleted, servers = self._copy.remove(self._progress)
+        total = spent(servers, datetime.now(UTC))
+        about = (
             f"About ${total.usd.likely:.4f} for {total.attempts} servers with {total.hours * 60:.0f} minutes together"
         )
-        return f"{text}, by list prices of {REGION}; the rest is less than a cent."
+        text = f"{about}, by list prices of {REGION}; the rest is less than a cent."
+        self._transcript.say("cost", Mark.GOOD, text)
+        return f"The copy and the bots' data are gone, {deleted} versions of documents in all."
 
     # Looking
 

@@ -76,16 +76,11 @@ class StudyCopy:
         (signature,) = links.signed(self._context.account, installation, self.id, [user_id]).values()
         return links.link(installation["Site"], self.project, user_id, signature)
 
-    def records(self) -> list[Server]:
-        """Read the records of all servers of the copy."""
-        recent = Records(self._documents).since(_made_at(self._documents, self.id))
-        return [record for record in recent if record.project_id == self.id]
+    def remove(self, progress: Callable[[str], None] = lambda _: None) -> tuple[int, list[Server]]:
+        """Remove the registration, the servers, and all documents.
 
-    def remove(self, progress: Callable[[str], None] = lambda _: None) -> int:
-        """Remove the registration, the servers, and all documents. Return how many versions of documents were deleted.
-
-        May be interrupted anywhere: its folder is deleted last, and leads the next rehearsal here. Raises `Problem` if
-        a server does not end.
+        Return how many versions of documents were deleted, and the records of the servers. May be interrupted anywhere:
+        its folder is deleted last, and leads the next rehearsal here. Raises `Problem` if a server does not end.
         """
         progress("removing the copy of the study from the list")
         unregister(self._documents, self.id)
@@ -96,15 +91,17 @@ class StudyCopy:
             raise Problem("A server of the copy still runs.", "Run `hippodrome stop --all`.", [*stopper.errors])
         progress("removing pages, answers and recordings")
         bucket = VersionedBucket(self._context.account, self._context.installation["Bucket"])
+        recent = Records(self._documents).since(_made_at(self._documents, self.id))
+        records = [record for record in recent if record.project_id == self.id]
         places = [
-            *(server.key(record.label) for record in self.records()),
+            *(server.key(record.label) for record in records),
             entries.folder(self.id),
             decisions.key(self.id),
             questions_folder(self.id),
             cells_key(self.id),
             f"{self.id}/",
         ]
-        return sum(bucket.delete(bucket.versions(place)) for place in places)
+        return sum(bucket.delete(bucket.versions(place)) for place in places), records
 
 
 def _until_functions_know() -> None:
