@@ -110,8 +110,8 @@ class Assigning:
         return outcomes
 
     def _outcome(self, project: Project, user_id: str, now: datetime) -> tuple[Outcome, datetime]:
-        progress = self._repository.progress(project.id, user_id)
-        path = [step.key for step in self._repository.own_project(project, user_id, progress).steps[:-1]]
+        progress, own = self._repository.path_of(project, user_id)
+        path = [step.key for step in own.steps[:-1]]
         return outcome_of(path, progress.answered, progress.has_ended, now, left_after(project))
 
 

@@ -11,7 +11,8 @@ import html
 import json
 import re
 import secrets
-from functools import cache, lru_cache
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from string import Template
 from typing import Any, NamedTuple
@@ -37,6 +38,20 @@ class Html(str):
     """Text that is HTML. `fill` escapes all other text."""
 
     __slots__ = ()
+
+
+@dataclass(frozen=True)
+class View:
+    """A page as one participant sees it, at a step of their path. The page of an end has a step of its own."""
+
+    project: Project
+    step: Step
+    user_id: str
+
+    @cached_property
+    def texts(self) -> Texts:
+        """The study's texts."""
+        return Texts(self.project.texts)
 
 
 def message_page(title: str, text: str, *, lang: str = IN_ENGLISH.language, more: Html | None = None) -> Page:
@@ -70,9 +85,7 @@ def form_message(title: str, text: str, *, step: str = "", ticket: str = "", als
 
 
 def frame(
-    project: Project,
-    step: Step,
-    user_id: str,
+    view: View,
     nonce: str,
     *,
     main: Html,
@@ -91,7 +104,7 @@ def frame(
     attributes of the body. `body` is the kind of page, for `style`. With `heading`, the study's name is the page's
     first heading. `sheets` names further style sheets of `hippodrome/web/`, which only some pages need.
     """
-    texts = Texts(project.texts)
+    project, step, texts = view.project, view.step, view.texts
     lang = lang or texts.language
     name = project.name or project.id
     at, steps = project.index(step.key), len(project.steps)
@@ -106,7 +119,7 @@ def frame(
         head=head,
         style=Html(style(body) + "".join(map(_sheet, sheets)) + _of_direction(lang)),
         body=body,
-        data=Html(fill("data", project=project.id, user=user_id, step=step.key) + data),
+        data=Html(fill("data", project=project.id, user=view.user_id, step=step.key) + data),
         header=fill("header", tag="h1" if heading else "p", name=name, progress=progress),
         main=main,
         footer=fill("footer", texts, researcher=project.researcher) if project.researcher else Html(),

@@ -171,8 +171,8 @@ class Journey:
         shown = visit.step_of_ticket(form.step, form.ticket, form.shown or "")
         if shown is not None:
             return shown
-        progress = self._repository.progress(visit.project.id, visit.user_id)
-        current = progress.due_step(self._repository.own_project(visit.project, visit.user_id, progress))
+        progress, own = self._repository.path_of(visit.project, visit.user_id)
+        current = progress.due_step(own)
         if not progress.has_arrived or progress.has_ended or form.step not in (None, current.key):
             return None
         if current.is_limited:

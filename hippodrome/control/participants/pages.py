@@ -16,6 +16,7 @@ from hippodrome.control.participants.fragments import Fragment
 from hippodrome.control.participants.frame import (
     Html,
     Page,
+    View,
     allowed_sources,
     fill,
     form_message,
@@ -33,12 +34,9 @@ LOBBY = "lobby"
 
 
 @dataclass(frozen=True)
-class StepView:
+class StepView(View):
     """What a step page shows to one participant."""
 
-    project: Project
-    step: Step
-    user_id: str
     source: str  # the text of the researcher's file
     values: Mapping[str, Any]  # the values that the file may use
     ticket: str
@@ -53,12 +51,12 @@ class StepView:
 
 
 @dataclass(frozen=True)
-class GameView:
-    """What the game page shows to one participant, who first waits and then plays on it."""
+class GameView(View):
+    """What the game page shows to one participant, who first waits and then plays on it.
 
-    project: Project  # as the participant's session runs it (`Project.for_session`)
-    step: Step
-    user_id: str
+    `project` is as the participant's session runs it (`Project.for_session`).
+    """
+
     state: Mapping[str, Any]  # the same as the response of `poll`, see docs/pages.md
     poll: str  # the address of the state
     page: str  # the page's own address, to which its form is sent too
@@ -74,7 +72,7 @@ class GameView:
 def step_page(view: StepView) -> Page:
     """Return a step page in its frame. Raises FragmentError."""
     nonce = secrets.token_urlsafe(16)
-    texts = Texts(view.project.texts)
+    texts = view.texts
     filled = _prepare(view.project, view.source).fill(view.values, nonce)
     content = Html(filled.html)
     is_asked = filled.has_fields
@@ -83,7 +81,7 @@ def step_page(view: StepView) -> Page:
             "form",
             action=view.action,
             named=_step_fields(view),
-            content=Html(_wrong(view, texts) + content),
+            content=Html(_wrong(view) + content),
             button=Html() if filled.has_submit else fill("button", text=texts["send" if view.final else "continue"]),
         )
     elif is_asked:
@@ -91,9 +89,7 @@ def step_page(view: StepView) -> Page:
     else:
         main = Html(f'<div class="page">\n{content}\n</div>')
     text = frame(
-        view.project,
-        view.step,
-        view.user_id,
+        view,
         nonce,
         main=main,
         script=script("step.js", nonce, module=True, texts=texts),
@@ -108,12 +104,11 @@ def step_page(view: StepView) -> Page:
 def end_page(project: Project, user_id: str, end: str, code: str, link: str) -> Page:
     """Return the page of an end for which the study has no page of its own, with the code and the link if there are."""
     nonce = secrets.token_urlsafe(16)
-    texts = Texts(project.texts)
+    view = View(project, Step(end, ""), user_id)
+    texts = view.texts
     title, text = texts["endTitle"], texts["endText"]
     page = frame(
-        project,
-        Step(end, ""),
-        user_id,
+        view,
         nonce,
         main=fill("message", title=title, text=text, more=end_code(texts, code, link)),
         script=script("step.js", nonce, module=True, texts=texts),
@@ -129,8 +124,7 @@ def fragment(view: StepView) -> str:
     The hidden fields that name the step come first. The program sends them with the form: HIPPO's front end posts all
     named elements of its form (IRLL/HIPPO_Gym_FrontEnd_React, `src/main.js`).
     """
-    wrong = _wrong(view, Texts(view.project.texts))
-    return _step_fields(view) + wrong + _prepare(view.project, view.source).render(view.values)
+    return _step_fields(view) + _wrong(view) + _prepare(view.project, view.source).render(view.values)
 
 
 def game_page(view: GameView) -> Page:
@@ -184,9 +178,7 @@ def game_page(view: GameView) -> Page:
     )
     refresh = Html() if over or in_lobby(view.state) else _REFRESH
     text = frame(
-        view.project,
-        view.step,
-        view.user_id,
+        view,
         nonce,
         main=main,
         script=script("game/main.js", nonce, module=True, also=modules, texts=texts),
@@ -225,7 +217,7 @@ def game_message(view: GameView) -> str:
 
     The form requests another server if the participant may have one.
     """
-    texts = Texts(view.project.texts)
+    texts = view.texts
     moved = texts["movedProgramTitle"], texts["movedProgram"]
     title, text = _over_texts(view.state, texts, below=True) if is_over(view.state) else moved
     action = "restart" if view.state.get("again") else "without" if view.state.get("without") else ""
@@ -253,11 +245,11 @@ def _done(view: StepView, is_asked: bool) -> Html:
     return Html(' data-done=""') if view.final and (view.answered or not is_asked) else Html()
 
 
-def _wrong(view: StepView, texts: Texts) -> Html:
+def _wrong(view: StepView) -> Html:
     """The sentence on how many answers of a check are not right yet."""
     if not view.wrong:
         return Html()
-    number = len(view.wrong)
+    texts, number = view.texts, len(view.wrong)
     parts = [texts["wrongOne"] if number == 1 else texts.say("wrongSome", number=number)]
     if view.tries_left:
         parts.append(texts["triesOne"] if view.tries_left == 1 else texts.say("triesSome", number=view.tries_left))

@@ -96,8 +96,7 @@ class Relays:
     def _start(self, visit: Visit, form: PostedForm) -> None:
         project, user_id = visit.project, visit.user_id
         owner, record = self._server_of(visit, form)
-        progress = self._repository.progress(project.id, user_id)
-        own = self._repository.own_project(project, user_id, progress)
+        progress, own = self._repository.path_of(project, user_id)
         is_due = progress.has_arrived and not progress.has_ended
         if not is_due or not participant.may_have_server(own, progress.due_step(own)):
             raise Refusal(409, "No server is due at this step.")

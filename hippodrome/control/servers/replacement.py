@@ -67,6 +67,5 @@ class Replacement:
         return members_of(self._services.repository, closed.project_id, closed.user_id)
 
     def _has_finished(self, project: Project, user_id: str) -> bool:
-        progress = self._services.repository.progress(project.id, user_id)
-        own = self._services.repository.own_project(project, user_id, progress)
+        progress, own = self._services.repository.path_of(project, user_id)
         return progress.has_ended or all(step in progress.answered for step in own.game_steps)

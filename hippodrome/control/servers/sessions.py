@@ -76,6 +76,5 @@ class Sessions:
         return all(self._has_left(project, user_id) for user_id in session.user_ids if user_id != leaves)
 
     def _has_left(self, project: Project, user_id: str) -> bool:
-        progress = self._repository.progress(project.id, user_id)
-        own = self._repository.own_project(project, user_id, progress)
+        progress, own = self._repository.path_of(project, user_id)
         return progress.has_ended or participant.is_past_server(own, progress.due_step(own))

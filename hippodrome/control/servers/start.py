@@ -84,7 +84,7 @@ class Start:
         """
         players = message.players
         if not players:
-            stored = self._repository.server(ids.server_label(project.id, message.user_id))
+            stored = self._repository.stored_server(project.id, message.user_id)
             players = stored.server.players if stored else 0
         now = self._services.project_cache.live_project(project.id, fits=lambda listed: listed.for_session(players))
         registration = now and now.for_session(players)
@@ -95,7 +95,7 @@ class Start:
     def _cancel_start(self, message: StartServer) -> None:
         """Start nothing: the project is closed, or has no sessions any more. If the server was started, stop it."""
         logger.warning("a start message was dropped: its project is closed, or has no sessions any more")
-        stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
+        stored = self._repository.stored_server(message.project_id, message.user_id)
         if stored and stored.server.is_open(message.attempt) and stored.server.state is ServerState.STARTING:
             stop = StopServer(message.project_id, message.user_id, message.attempt, Reason.STOPPED)
             self._platform.bus.publish(Topic.STOP, to_message(stop))

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hippodrome.control.log import failure, logger
-from hippodrome.control.model import ids
 from hippodrome.control.model.messages import StopServer, StopUser
 from hippodrome.control.servers.batches import for_each
 from hippodrome.control.servers.services import ServerServices
@@ -53,7 +52,7 @@ class Stops:
 
     def _open(self, stop: StopServer) -> StopServer | None:
         """The message, if the participant has an open server in the project or may have a session; else None."""
-        stored = self._services.repository.server(ids.server_label(stop.project_id, stop.user_id))
+        stored = self._services.repository.stored_server(stop.project_id, stop.user_id)
         if stored is not None and not stored.server.is_closed:
             return stop
         return stop if self._sessions.has_sessions(stop.project_id) else None

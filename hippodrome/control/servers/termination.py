@@ -106,7 +106,7 @@ class Termination:
         it had sessions; their message may be for their session's server. Raises `RetryLater` if the server is started
         at the same time.
         """
-        stored = self._repository.server(ids.server_label(message.project_id, message.user_id))
+        stored = self._repository.stored_server(message.project_id, message.user_id)
         if stored is not None and stored.server.is_open(message.attempt or stored.server.attempt):
             return stored
         if message.reason != Reason.STOPPED or (stored is not None and message.attempt is not None):

@@ -101,9 +101,13 @@ class Repository:
         has_one = project.assigns and progress.assigned is not None
         return self.assignment(project.id, user_id, progress.assigned) if has_one else None
 
-    def own_project(self, project: Project, user_id: str, progress: Progress) -> Project:
-        """Return the project with the participant's own path. AWS calls: one read, if they have an assignment."""
-        return project.own(self.assignment_of(project, user_id, progress))
+    def path_of(self, project: Project, user_id: str) -> tuple[Progress, Project]:
+        """Return the participant's progress, and the project with their own path.
+
+        AWS calls: one listing, and one read if they have an assignment.
+        """
+        progress = self.progress(project.id, user_id)
+        return progress, project.own(self.assignment_of(project, user_id, progress))
 
     def _created(self, key: str, body: bytes) -> bool:
         try:
@@ -152,8 +156,12 @@ class Repository:
 
     def server_of(self, project_id: str, user_id: str) -> Server | None:
         """Return the record of the server of this participant or session; None if there is none."""
-        stored = self.server(ids.server_label(project_id, user_id))
+        stored = self.stored_server(project_id, user_id)
         return stored.server if stored else None
+
+    def stored_server(self, project_id: str, owner: str) -> Versioned | None:
+        """Return the record of the server of this participant, session or warm server, with its ETag; None if none."""
+        return self.server(ids.server_label(project_id, owner))
 
     def server(self, label: str) -> Versioned | None:
         """Return the record under a label, with its ETag; None if there is none."""

@@ -162,8 +162,7 @@ class GameStep:
             if may_go_without(record):
                 self._services.answers.store(visit, step, participant.failed_game(project, user_id))
         elif (attempt := requestable_attempt(record)) is not None:
-            progress = self._repository.progress(project.id, user_id)
-            own = self._repository.own_project(project, user_id, progress)
+            progress, own = self._repository.path_of(project, user_id)
             if not progress.has_ended and participant.may_have_server(own, progress.due_step(own)):
                 self._request_server(visit, owner, attempt)  # the ticket of a game that is over stays valid
 

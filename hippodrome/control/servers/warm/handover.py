@@ -42,7 +42,7 @@ class Handovers:
         if (found_in_pool := self._pools.take(project)) is None:
             return None
         warm_id, entry = found_in_pool
-        found = self._repository.server(ids.server_label(project.id, warm_id))
+        found = self._repository.stored_server(project.id, warm_id)
         if found is None or found.server.state is not ServerState.READY:
             return None  # the warm server has ended; the sweep removes it from its pool
         warm_server, attempt = found.server, stored.server.attempt

@@ -141,7 +141,7 @@ class Pools:
 
     def _repair(self, project_id: str, pool: Pool, repository: Repository) -> None:
         def state_of(warm_id: str) -> ServerState:
-            stored = repository.server(ids.server_label(project_id, warm_id))
+            stored = repository.stored_server(project_id, warm_id)
             return stored.server.state if stored else ServerState.QUEUED
 
         states, _ = for_each(self._platform, pool.warm_servers, state_of, "a warm server's record cannot be read")
