@@ -54,7 +54,7 @@ def refusal(
     return None
 
 
-def headers_for(origin: str | None, sent: Collection[tuple[str, str]], origins: Collection[str]) -> dict[str, str]:
+def headers_for(origin: str | None, sent: Mapping[str, str], origins: Collection[str]) -> dict[str, str]:
     """Return the headers to send with a response. `sent` are the headers that the function has returned.
 
     On AWS any origin may read responses, since only participants have their links. Here a study's id suffices, so only

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import traceback
-from collections.abc import Awaitable, Callable, Collection, Mapping, MutableMapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, MutableMapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -52,8 +52,9 @@ class App:
         answer = await self._answer(scope, receive)
         if answer is None:
             return
-        headers = [*self._sent_headers(scope, answer.headers), ("content-length", str(len(answer.body)))]
-        encoded = [(name.encode("latin-1"), value.encode("latin-1", "replace")) for name, value in headers]
+        origin = joined(headers_of(scope)).get("origin")
+        headers = access.headers_for(origin, answer.headers, self._origins) | {"content-length": str(len(answer.body))}
+        encoded = [(name.encode("latin-1"), value.encode("latin-1", "replace")) for name, value in headers.items()]
         await send({"type": "http.response.start", "status": answer.status, "headers": encoded})
         body = b"" if scope["method"] == "HEAD" else answer.body
         await send({"type": "http.response.body", "body": body})
@@ -92,13 +93,6 @@ class App:
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._threads, self._call, self._functions[route.function], event)
 
-    def _sent_headers(self, scope: Scope, headers: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-        """The headers that are sent with an answer (`access.headers_for`), and its cookies."""
-        cookies = [header for header in headers if header[0] == "set-cookie"]
-        others = [header for header in headers if header[0] != "set-cookie"]
-        sent = access.headers_for(joined(headers_of(scope)).get("origin"), others, self._origins)
-        return [*sent.items(), *cookies]
-
     def _call(self, handler: Handler, event: dict[str, Any]) -> GatewayResponse:
         try:
             return answer_of(handler(event, None))
@@ -121,7 +115,7 @@ async def _body(receive: Receive) -> bytes | None:
 
 
 def _plain(status: int, text: str) -> GatewayResponse:
-    return GatewayResponse(status, [("content-type", "text/plain; charset=utf-8")], text.encode())
+    return GatewayResponse(status, {"content-type": "text/plain; charset=utf-8"}, text.encode())
 
 
 def _message(status: int, text: str) -> GatewayResponse:
@@ -134,5 +128,5 @@ def _nothing_here(method: str, accept: str) -> GatewayResponse:
         return _message(404, "Not Found")
     text = "Please open your study link again. It looks like /next?projectId=…"
     page = frame.message_page("Page not found", text)
-    headers = {"Content-Type": "text/html; charset=utf-8", **page.headers}
-    return GatewayResponse(404, [(name.lower(), value) for name, value in headers.items()], page.html.encode())
+    headers = {name.lower(): value for name, value in page.headers.items()}
+    return GatewayResponse(404, {"content-type": "text/html; charset=utf-8", **headers}, page.html.encode())

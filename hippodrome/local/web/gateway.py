@@ -12,14 +12,11 @@ from __future__ import annotations
 import base64
 import json
 import re
-import time
-import uuid
 from collections.abc import Iterable, Mapping, MutableMapping
-from datetime import UTC, datetime
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
-_HOST = "127.0.0.1"  # the address of a request that names no host
+_HOST = "127.0.0.1"  # the address of a client that has none
 
 Scope = MutableMapping[str, Any]
 
@@ -56,7 +53,7 @@ class GatewayResponse(NamedTuple):
     """The status, headers and body that a function returns. The names of headers are in lower case."""
 
     status: int
-    headers: list[tuple[str, str]]
+    headers: dict[str, str]
     body: bytes
 
 
@@ -74,43 +71,24 @@ def joined(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
 
 
 def event_of(scope: Scope, body: bytes, route: Route, parameters: Mapping[str, str]) -> dict[str, Any]:
-    """Return the event of payload format 2.0 for this request."""
-    sent = headers_of(scope)
-    headers = joined(pair for pair in sent if pair[0] != "cookie")
-    cookies = [part.strip() for name, value in sent if name == "cookie" for part in value.split(";") if part.strip()]
+    """Return the event of payload format 2.0 for this request, with the fields that functions read."""
+    headers = joined(headers_of(scope))
     raw_query = scope["query_string"].decode("latin-1")
     query = joined(parse_qsl(raw_query, keep_blank_values=True))
-    now = time.time()
-    host = headers.get("host", _HOST)
-    route_key = f"{scope['method']} {route.path}"
+    http = {
+        "method": scope["method"],
+        "path": scope["path"],
+        "sourceIp": (scope.get("client") or (_HOST,))[0],
+    }
     event: dict[str, Any] = {
         "version": "2.0",
-        "routeKey": route_key,
+        "routeKey": f"{scope['method']} {route.path}",
         "rawPath": scope["path"],
         "rawQueryString": raw_query,
         "headers": headers,
-        "requestContext": {
-            "accountId": "000000000000",
-            "apiId": "local",
-            "domainName": host,
-            "domainPrefix": host.partition(".")[0],
-            "http": {
-                "method": scope["method"],
-                "path": scope["path"],
-                "protocol": f"HTTP/{scope.get('http_version', '1.1')}",
-                "sourceIp": (scope.get("client") or (_HOST,))[0],
-                "userAgent": headers.get("user-agent", ""),
-            },
-            "requestId": str(uuid.uuid4()),
-            "routeKey": route_key,
-            "stage": "$default",
-            "time": datetime.fromtimestamp(now, UTC).strftime("%d/%b/%Y:%H:%M:%S +0000"),
-            "timeEpoch": int(now * 1000),
-        },
+        "requestContext": {"http": http},
         "isBase64Encoded": False,
     }
-    if cookies:
-        event["cookies"] = cookies
     if query:
         event["queryStringParameters"] = query
     if parameters:
@@ -131,12 +109,10 @@ def answer_of(result: Any) -> GatewayResponse:
         return json_answer(200, result)
     body = result.get("body") or ""
     data = base64.b64decode(body, validate=True) if result.get("isBase64Encoded") else str(body).encode()
-    headers = [(str(name).lower(), str(value)) for name, value in (result.get("headers") or {}).items()]
-    if not any(name == "content-type" for name, _ in headers):
-        headers.append(("content-type", "text/plain; charset=utf-8"))
-    headers += [("set-cookie", str(cookie)) for cookie in result.get("cookies") or ()]
-    sent = [header for header in headers if header[0] not in ("content-length", "transfer-encoding", "connection")]
-    return GatewayResponse(int(result["statusCode"]), sent, data)
+    headers = {str(name).lower(): str(value) for name, value in (result.get("headers") or {}).items()}
+    for set_here in ("content-length", "transfer-encoding", "connection"):
+        headers.pop(set_here, None)
+    return GatewayResponse(int(result["statusCode"]), {"content-type": "text/plain; charset=utf-8", **headers}, data)
 
 
 def _text(body: bytes, content_type: str) -> str | None:
@@ -151,4 +127,4 @@ def _text(body: bytes, content_type: str) -> str | None:
 
 def json_answer(status: int, data: Any) -> GatewayResponse:
     """Return a response with JSON."""
-    return GatewayResponse(status, [("content-type", "application/json")], json.dumps(data).encode())
+    return GatewayResponse(status, {"content-type": "application/json"}, json.dumps(data).encode())

@@ -6,7 +6,6 @@ import base64
 import json
 import socket
 import threading
-import time
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -62,7 +61,7 @@ def test_a_get_becomes_an_event_of_format_2(site: Site) -> None:
     event = site.event(
         "GET",
         "/next?projectId=p&userId=a%20b&x=1&x=2&y=",
-        headers=[("Accept", "text/html"), ("X-Two", "1"), ("X-Two", "2"), ("Cookie", "a=1; b=2"), ("User-Agent", "me")],
+        headers=[("Accept", "text/html"), ("X-Two", "1"), ("X-Two", "2")],
     )
     assert event["version"] == "2.0"
     assert event["routeKey"] == "GET /next"
@@ -71,20 +70,9 @@ def test_a_get_becomes_an_event_of_format_2(site: Site) -> None:
     assert event["queryStringParameters"] == {"projectId": "p", "userId": "a b", "x": "1,2", "y": ""}
     assert event["headers"]["accept"] == "text/html"
     assert event["headers"]["x-two"] == "1,2"
-    assert event["cookies"] == ["a=1", "b=2"]
     assert "body" not in event
     assert event["isBase64Encoded"] is False
-    context = event["requestContext"]
-    assert context["http"] == {
-        "method": "GET",
-        "path": "/next",
-        "protocol": "HTTP/1.1",
-        "sourceIp": "127.0.0.1",
-        "userAgent": "me",
-    }
-    assert context["stage"] == "$default"
-    assert context["requestId"]
-    assert abs(context["timeEpoch"] / 1000 - time.time()) < 10
+    assert event["requestContext"]["http"] == {"method": "GET", "path": "/next", "sourceIp": "127.0.0.1"}
     json.dumps(event)
 
 
@@ -146,18 +134,16 @@ def test_functions_get_the_decoded_path(site: Site) -> None:
     assert event["pathParameters"]["file"] == "my picture.png"
 
 
-def test_a_response_keeps_status_headers_cookies_and_body(site: Site) -> None:
+def test_a_response_keeps_status_headers_and_body(site: Site) -> None:
     site.answer = lambda event: {
         "statusCode": 303,
         "headers": {"Location": "/next?x=1", "Content-Type": "text/html; charset=utf-8", "X-N": 5},
-        "cookies": ["a=1; Path=/", "b=2"],
         "body": "<p>é",
     }
     answer = site.http.get("/next")
     assert answer.status_code == 303
     assert answer.headers["location"] == "/next?x=1"
     assert answer.headers["x-n"] == "5"
-    assert answer.headers.get_list("set-cookie") == ["a=1; Path=/", "b=2"]
     assert answer.text == "<p>é"
 
 
@@ -343,7 +329,6 @@ def test_answers_can_be_read_by_no_other_origin_than_those_that_were_named() -> 
                 "Access-Control-Allow-Methods": "GET",
                 "Referrer-Policy": "no-referrer",
             },
-            "cookies": ["a=1", "b=2"],
         }
         try:
             answers = [
@@ -357,7 +342,6 @@ def test_answers_can_be_read_by_no_other_origin_than_those_that_were_named() -> 
             own = site.http.get("/next")
             assert not any(name.startswith("access-control") for name in own.headers)
             assert own.headers["referrer-policy"] == "same-origin"  # so that our forms say where they come from
-            assert own.headers.get_list("set-cookie") == ["a=1", "b=2"]
         finally:
             site.http.close()
             site.server.close()
