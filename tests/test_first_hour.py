@@ -65,7 +65,7 @@ ELSEWHERE = {
     "Interrupted. The same command goes on from here.": "deployment/study/test_register_refused.py",
     "Something of that name is in another region: say …": "deployment/lifecycle/test_destroy_waits.py",
     "This has to wait until …; then the rest is deleted.": "deployment/lifecycle/test_destroy_waits.py",
-    "After … ACM still says that the site's certificate is in use by …": "deployment/lifecycle/test_destroy_waits.py",
+    "After … AWS still refuses to delete …": "deployment/lifecycle/test_destroy_waits.py",
 }
 """Failures that other tests bring about, and where."""
 

@@ -78,7 +78,7 @@ class Executor:
         the next round begins with what the last look found. If something was found and its plan is empty, this only
         waits until a look finds nothing.
         """
-        timer, executed, state = self._timer(), 0, look()
+        timer, executed, state = self.timer(), 0, look()
         while state:
             if steps := plan(state):
                 self.execute(steps, note)
@@ -96,7 +96,7 @@ class Executor:
 
         With `title` a progress bar is shown from the first look that finds something.
         """
-        timer, state = self._timer(), look()
+        timer, state = self.timer(), look()
         if not state:
             return state
         with contextlib.ExitStack() as stack:
@@ -121,11 +121,12 @@ class Executor:
                     raise
         return act()
 
-    def _timer(self) -> _Timer:
-        return _Timer(self._clock, self.sleep)
+    def timer(self) -> Timer:
+        """Make a timer, which begins now."""
+        return Timer(self._clock, self.sleep)
 
 
-class _Timer:
+class Timer:
     """Measures seconds: by the clock, or by the sum of all sleeps if that is more, as with a test's `sleep`."""
 
     def __init__(self, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
@@ -138,5 +139,10 @@ class _Timer:
         self._sleep(seconds)
         self._slept += seconds
 
+    @property
+    def elapsed(self) -> float:
+        """The seconds since it was made."""
+        return max(self._clock() - self._began, self._slept)
+
     def over(self, seconds: float | None) -> bool:
-        return seconds is not None and max(self._clock() - self._began, self._slept) >= seconds
+        return seconds is not None and self.elapsed >= seconds

@@ -22,9 +22,10 @@ from botocore.exceptions import BotoCoreError, ClientError
 from hippodrome.control.aws import errors
 from hippodrome.deployment.aws.account import Account
 from hippodrome.deployment.stack.code_bucket import CodeBucket
-from hippodrome.deployment.stack.listings import KEY_TYPES
 
 NOTE = "destroy/validation-records.json"  # the key of the note in the code bucket
+KEY_TYPES = ("RSA_1024", "RSA_2048", "RSA_3072", "RSA_4096", "EC_prime256v1", "EC_secp384r1", "EC_secp521r1")
+"""The key types for ListCertificates, which lists only RSA_1024 and RSA_2048 without them (ACM API reference)."""
 _AT_ONCE = 8
 _ACM = ".acm-validations.aws"
 _GONE = {"ResourceNotFoundException", "NoSuchHostedZone"}
@@ -46,11 +47,6 @@ class Validation(NamedTuple):
 def of_certificate(account: Account, arn: str, zone: str) -> list[Validation]:
     """Ask ACM for the validation records of a certificate; empty if it is gone."""
     return [Validation(zone, name, value) for name, value in _records(_describe(account, arn, account.region))]
-
-
-def in_use_by(account: Account, arn: str) -> list[str]:
-    """Ask ACM for the ARNs of the resources that use a certificate; empty if it is gone."""
-    return list(_describe(account, arn, account.region).get("InUseBy", ()))
 
 
 def remember(bucket: CodeBucket, validations: Iterable[Validation]) -> None:

@@ -1,27 +1,144 @@
-"""Deletes a stack. If something blocks the deletion for a while, waits for it or removes it, and tries again."""
+"""Deletes a stack. What AWS refuses for a while is tried again, by the table `FAILURES`.
+
+CloudFormation deletes what it can and ends in DELETE_FAILED, with a service's message for each resource that is left;
+deleting the stack again goes on from there. A message that is not in the table, such as that of a missing permission,
+ends the command.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable
+from enum import Enum
+from typing import Any, NamedTuple
+
+from botocore.exceptions import ClientError
 
 from hippodrome.console import screen
 from hippodrome.console.formatting import duration
 from hippodrome.console.problem import Problem
+from hippodrome.control.aws import errors
 from hippodrome.deployment.aws.account import Account
 from hippodrome.deployment.core.stages import Executor
-from hippodrome.deployment.stack import acm_records, guardduty, policies
-from hippodrome.deployment.stack.deletion_failures import Recovery, recoveries, recovery_from
 from hippodrome.deployment.stack.stack import FailedResource, NotDeleted, Stack
 
-TRIES = 8  # attempts to delete the stack
-PAUSE = 20  # seconds between two looks at what blocks the deletion
-IN_USE = 75 * 60
-"""The seconds for which a certificate may stay in use after API Gateway's domain is gone: 10 to 60 minutes are reported
-(aws/aws-cdk issues 36265 and 16608; amplify-education/serverless-domain-manager issue 32)."""
-DISAGREEING = 5 * 60  # seconds to wait if CloudFormation says that the certificate is in use, and ACM lists no use
-NETWORK_IN_USE = 25 * 60
-"""The seconds for which network interfaces of tasks that have ended may stay: 5 to 20 minutes are reported
-(alchemy-run/alchemy pull request 1125)."""
+PAUSE = 30  # seconds between two tries
+
+
+class Remedy(Enum):
+    """What is done before the next try. Each try also stops servers, and detaches the stack's managed policies."""
+
+    WAIT = "wait"
+    FREE_NETWORK = "remove what GuardDuty has put into the network"
+    FREE_ROLE = "take foreign policies from the role"
+    LEAVE_OUT = "leave the resource out, which is gone"
+
+
+class KnownFailure(NamedTuple):
+    """A failure that passes: its resource types ("" for all), its message (a pattern, ignoring case), its remedy."""
+
+    types: str
+    says: str
+    minutes: int  # for which it may last
+    until: str  # follows "This has to wait until"
+    source: str  # where the message, and how long it lasts, was seen
+    remedy: Remedy = Remedy.WAIT
+
+
+FAILURES: tuple[KnownFailure, ...] = (
+    KnownFailure(
+        r"AWS::ECS::Cluster",
+        r"ClusterContains(Tasks|ContainerInstances|Services)|contains? tasks|"
+        r"while (Tasks|Services|Container Instances) are (active|draining)",
+        10,
+        "servers are stopped",
+        "gruntwork-io/cloud-nuke issue 368; aws-samples/aws-scalable-big-blue-button-example issue 79",
+    ),
+    KnownFailure(
+        r"AWS::ECS::Cluster",
+        r"busy state|UpdateInProgress|ResourceInUse|is in use|was not ACTIVE|Capacity Providers are attached",
+        10,
+        "ECS has ended another operation",
+        "hashicorp/terraform-provider-aws issue 11285 and pull request 45794",
+    ),
+    KnownFailure(
+        r"AWS::EC2::(VPC|Subnet|SecurityGroup|InternetGateway|RouteTable|VPCEndpoint|VPCGatewayAttachment|Route|"
+        r"SubnetRouteTableAssociation)",
+        r"has dependencies|has a dependent object|dependent object|DependencyViolation|mapped public address|"
+        r"is (currently )?in use|InvalidGroup\.InUse",
+        25,
+        "the addresses of servers that have ended are given back, which takes up to 20 minutes",
+        "aws/aws-cdk issue 14456; gruntwork-io/cloud-nuke pull request 591; alchemy-run/alchemy pull request 1125. "
+        "GuardDuty's Runtime Monitoring leaves an endpoint and a security group in every VPC with tasks: GuardDuty "
+        'User Guide, "Clean up Runtime Monitoring resources"; hashicorp/terraform-provider-aws issue 46747',
+        Remedy.FREE_NETWORK,
+    ),
+    KnownFailure(
+        r"AWS::CertificateManager::Certificate",
+        r"is in use|ResourceInUse",
+        75,
+        "AWS has dismantled the site's address, which takes 10 to 60 minutes, and the certificate is in use no more",
+        "aws/aws-cdk issues 36265 and 16608; amplify-education/serverless-domain-manager issue 32",
+    ),
+    KnownFailure(
+        r"AWS::IAM::ManagedPolicy",
+        r"attached to entities|more than one version|DeleteConflict",
+        2,
+        "the policy is detached",
+        "hashicorp/terraform-provider-aws issue 32906; redradrat/aws-iam-operator issue 13; IAM's DeletePolicy",
+    ),
+    KnownFailure(
+        r"AWS::IAM::Role",
+        r"must detach all policies first|must delete policies first",
+        2,
+        "foreign policies are taken from the role",
+        "aws/aws-parallelcluster issue 4031; convox/rack issue 2672; IAM's DeleteRole",
+        Remedy.FREE_ROLE,
+    ),
+    KnownFailure(
+        r"AWS::ECR::Repository",
+        r"RepositoryNotEmpty|still contains images|not empty",
+        10,
+        "the image repository is empty",
+        "brentley/appmeshworkshop issue 31; here: an image that is pushed while CloudFormation empties the repository",
+    ),
+    KnownFailure(
+        r"AWS::(Scheduler::ScheduleGroup|Logs::LogGroup|Lambda::\w+|ApiGatewayV2::\w+|Events::Rule)",
+        r"Conflict|in progress|being (deleted|updated|modified)|OperationAborted|is in use|ResourceInUse|"
+        r"targets|Please try again",
+        10,
+        "AWS has ended another operation",
+        "API references of these services, errors of their deletions (read November 2026)",
+    ),
+    KnownFailure(
+        r"AWS::Route53::RecordSet",
+        r"NoSuchHostedZone|No hosted zone found with ID",
+        2,
+        "the records of the hosted zone, which is gone, are left out",
+        "byu-oit/handel pull request 486; Route 53 API Reference, NoSuchHostedZone",
+        Remedy.LEAVE_OUT,
+    ),
+    KnownFailure(
+        "",
+        r"Rate exceeded|Throttl|TooManyRequests|Internal ?(Failure|Error|Server)|ServiceUnavailable|"
+        r"NotStabilized|not stabili[sz]e|timed? ?out|PriorRequestNotComplete|OperationAborted",
+        10,
+        "AWS is less busy",
+        "CloudFormation's handler error codes (CloudFormation CLI guide, resource-type-test-contract-errors)",
+    ),
+)
+
+_DENIED = re.compile(r"not authorized|Access ?Denied|explicit deny", re.IGNORECASE)
+
+
+def known_failure(failure: FailedResource) -> KnownFailure | None:
+    """Find the failure in the table; None if it does not pass by itself."""
+    if _DENIED.search(failure.reason):
+        return None
+    for row in FAILURES:
+        if re.fullmatch(row.types or ".*", failure.type) and re.search(row.says, failure.reason, re.IGNORECASE):
+            return row
+    return None
 
 
 class StackDeletion:
@@ -34,118 +151,116 @@ class StackDeletion:
         self._stack = stack
         self._executor = executor
         self._stop_servers = stop_servers
-        self._without: list[str] = []  # logical ids of resources that the next try leaves out
 
     def run(self, title: str = "Deleting the stack") -> None:
-        """Delete the stack, in up to `TRIES` tries. Raises `Problem` for a failure that waiting does not end."""
-        self._executor.retry(lambda: self._try(title), self._recover, TRIES)
+        """Delete the stack, in as many tries as it takes.
 
-    def _try(self, title: str) -> None:
-        self._stop_servers()
-        self._free_policies()
-        self._stack.delete(title, self._without)
+        Raises `Problem` for a failure that is not in the table, or that lasts longer than it says.
+        """
+        timer, without = self._executor.timer(), list[str]()
+        since: dict[KnownFailure, float] = {}  # the timer's seconds at which a failure was first seen
+        while True:
+            self._stop_servers()
+            self._detach_policies()
+            try:
+                self._stack.delete(title, without)
+                return
+            except NotDeleted as error:
+                known = [(failure, row) for failure in error.failures if (row := known_failure(failure))]
+                if not known or len(known) < len(error.failures):
+                    raise
+                for row in dict.fromkeys(row for _, row in known):
+                    if row not in since:
+                        screen.info(f"This has to wait until {row.until}; then the rest is deleted.")
+                        since[row] = timer.elapsed
+                    if timer.elapsed - since[row] >= row.minutes * 60:
+                        raise _lasting(row, error) from None
+            without = [failure.logical_id for failure, row in known if row.remedy is Remedy.LEAVE_OUT]
+            if any(row.remedy is Remedy.FREE_NETWORK for _, row in known):
+                self._remove_guardduty()
+            for failure, row in known:
+                if row.remedy is Remedy.FREE_ROLE:
+                    self._free_role(failure.physical_id)
+            timer.sleep(PAUSE)
 
-    def _recover(self, error: Exception) -> bool:
-        """Wait for what blocks the deletion, or remove it. Return False if neither is possible."""
-        if not isinstance(error, NotDeleted) or not (needed := recoveries(error.failures)):
-            return False
-        self._without = [failure.logical_id for failure in error.failures if recovery_from(failure) is Recovery.GONE]
-        for recovery in needed:
-            screen.info(f"This has to wait until {recovery.value}; then the rest is deleted.")
-            self._help(recovery, error.failures)
-        return True
+    def _detach_policies(self) -> None:
+        """Detach the stack's managed policies, delete their older versions, and print who had them.
 
-    def _help(self, recovery: Recovery, failures: Sequence[FailedResource]) -> None:
-        match recovery:
-            case Recovery.CERTIFICATE:
-                for failure in failures:
-                    if failure.type == "AWS::CertificateManager::Certificate":
-                        self._certificate_free(failure.physical_id)
-            case Recovery.NETWORK:
-                self._network_free()
-            case Recovery.ROLE:
-                for failure in failures:
-                    if failure.type == "AWS::IAM::Role":
-                        policies.free_role(self._account, failure.physical_id)
-            case Recovery.PAUSE:
-                self._executor.sleep(PAUSE)
-            case Recovery.SERVERS | Recovery.POLICY | Recovery.GONE:
-                pass  # each try does that itself
-
-    def _free_policies(self) -> None:
-        """Detach the stack's managed policies, and print to whom they were attached."""
+        IAM deletes no policy that is attached or has other versions than its default.
+        """
+        iam = self._account.client("iam")
         for arn in self._stack.ids_of("AWS::IAM::ManagedPolicy"):
-            if freed := policies.detach(self._account, arn):
-                screen.success(f"The policy {freed.name} is detached from {freed.whom}.")
+            holders = []
+            for page in _pages(iam, "list_entities_for_policy", PolicyArn=arn, PolicyUsageFilter="PermissionsPolicy"):
+                for kind in ("User", "Group", "Role"):
+                    for holder in page.get(f"Policy{kind}s", ()):
+                        name = {f"{kind}Name": holder[f"{kind}Name"]}
+                        _ignoring_absence(getattr(iam, f"detach_{kind.lower()}_policy"), PolicyArn=arn, **name)
+                        holders.append(f"the {kind.lower()} {holder[f'{kind}Name']}")
+            if holders:
+                screen.success(f"The policy {arn.rpartition('/')[2]} is detached from {', '.join(holders)}.")
+            for page in _pages(iam, "list_policy_versions", PolicyArn=arn):
+                for version in page["Versions"]:
+                    if not version["IsDefaultVersion"]:
+                        _ignoring_absence(iam.delete_policy_version, PolicyArn=arn, VersionId=version["VersionId"])
 
-    def _certificate_free(self, arn: str) -> None:
-        """Wait until ACM lists nothing that uses the certificate. Raises `Problem` after `IN_USE` seconds."""
+    def _free_role(self, name: str) -> None:
+        """Take all policies from a role, also those that people or an organization's rules have added."""
+        iam = self._account.client("iam")
+        for page in _pages(iam, "list_attached_role_policies", RoleName=name):
+            for policy in page["AttachedPolicies"]:
+                _ignoring_absence(iam.detach_role_policy, RoleName=name, PolicyArn=policy["PolicyArn"])
+        for page in _pages(iam, "list_role_policies", RoleName=name):
+            for policy in page["PolicyNames"]:
+                _ignoring_absence(iam.delete_role_policy, RoleName=name, PolicyName=policy)
 
-        def users() -> list[str]:
-            arns = acm_records.in_use_by(self._account, arn)
-            if others := [arn_of_user for arn_of_user in arns if _is_other_use(self._account, arn_of_user)]:
-                raise Problem(
-                    f"The site's certificate is used by {', '.join(others)}.",
-                    "Take the certificate away from there, and run the same command again.",
-                )
-            return arns
-
-        title = "The site's certificate is in use until AWS has dismantled the site's address: 10 to 60 minutes"
-        # ACM's list of uses and its refusals to delete need not agree at once.
-        if users_now := self._until_none(users, title, IN_USE, disagreeing=DISAGREEING):
-            raise Problem(
-                f"After {duration(IN_USE)} ACM still says that the site's certificate is in use by "
-                f"{', '.join(users_now)}.",
-                "Run the same command later; it goes on from here. If that lasts for a day, only AWS's support can "
-                "release it. It costs nothing.",
-            )
-
-    def _network_free(self) -> None:
-        """Wait until the stack's network has no network interface. Raises `Problem` after `NETWORK_IN_USE` seconds.
-
-        What GuardDuty has put into the stack's own VPC is removed.
-        """
-        vpcs, groups = self._stack.ids_of("AWS::EC2::VPC"), self._stack.ids_of("AWS::EC2::SecurityGroup")
-        where = {"Name": "vpc-id", "Values": vpcs} if vpcs else {"Name": "group-id", "Values": groups}
-        client = self._account.client("ec2")
-        guardduty.remove_endpoints(client, vpcs)
-
-        def interfaces() -> list[str]:
-            pages = client.get_paginator("describe_network_interfaces").paginate(Filters=[where])
-            all_interfaces = (
-                [interface for page in pages for interface in page["NetworkInterfaces"]] if where["Values"] else []
-            )
-            for one in all_interfaces:
-                if instance := one.get("Attachment", {}).get("InstanceId"):
-                    raise Problem(
-                        f"The instance {instance} is in the network of the installation.",
-                        "It is not Hippodrome's: remove it, and run the same command again.",
-                    )
-            return [str(interface["NetworkInterfaceId"]) for interface in all_interfaces]
-
-        title = "The addresses of servers that have ended are in use for up to 20 minutes"
-        if interfaces_left := self._until_none(interfaces, title, NETWORK_IN_USE, disagreeing=PAUSE):
-            raise Problem(
-                f"After {duration(NETWORK_IN_USE)} the network still has the interfaces {', '.join(interfaces_left)}.",
-                "See in the EC2 console what they belong to, remove that, and run the same command again.",
-            )
-        guardduty.remove_groups(client, vpcs)
-
-    def _until_none(
-        self, look: Callable[[], Sequence[str]], title: str, seconds: float, disagreeing: float
-    ) -> Sequence[str]:
-        """Wait until a look finds nothing, for `seconds` at most. Return what the last look found.
-
-        AWS has refused a deletion because something is in use. If the first look finds nothing, AWS's lists are not up
-        to date, so no look can tell: wait `disagreeing` seconds.
-        """
-        if not look():
-            self._executor.sleep(disagreeing)
-            return ()
-        return self._executor.wait(look, seconds, pause=PAUSE, title=f"{title}; it is safe to interrupt this")
+    def _remove_guardduty(self) -> None:
+        """Delete GuardDuty's endpoints and security groups in the stack's own VPC, never in the administrator's."""
+        ec2 = self._account.client("ec2")
+        for vpc in self._stack.ids_of("AWS::EC2::VPC"):
+            in_vpc = {"Name": "vpc-id", "Values": [vpc]}
+            endpoints = [
+                endpoint["VpcEndpointId"]
+                for page in ec2.get_paginator("describe_vpc_endpoints").paginate(Filters=[in_vpc])
+                for endpoint in page["VpcEndpoints"]
+                if endpoint["ServiceName"].endswith(".guardduty-data")
+                and endpoint["State"].lower() not in ("deleting", "deleted")
+            ]
+            if endpoints:
+                ec2.delete_vpc_endpoints(VpcEndpointIds=endpoints)
+                screen.info(f"GuardDuty's endpoint in the installation's network is deleted: {', '.join(endpoints)}.")
+            of_guardduty = {"Name": "group-name", "Values": ["GuardDutyManagedSecurityGroup-*"]}
+            for group in ec2.describe_security_groups(Filters=[in_vpc, of_guardduty])["SecurityGroups"]:
+                try:
+                    ec2.delete_security_group(GroupId=group["GroupId"])
+                except ClientError as error:
+                    if errors.code(error) != "DependencyViolation":  # the endpoint's interfaces go some minutes later
+                        raise
 
 
-def _is_other_use(account: Account, arn: str) -> bool:
-    """Whether a resource outside of API Gateway uses the certificate. API Gateway's own uses end by themselves."""
-    _, _, service, _, owner, *_ = arn.split(":")
-    return owner == account.id and service != "apigateway"
+def _lasting(row: KnownFailure, error: NotDeleted) -> Problem:
+    return Problem(
+        f"After {duration(row.minutes * 60)} AWS still refuses to delete "
+        f"{', '.join(failure.logical_id for failure in error.failures)}.",
+        "Run the same command later; it goes on from here. The console shows what still uses them: remove that. Only "
+        "AWS's support can release a certificate that stays in use for a day; it costs nothing.",
+        error.details,
+    )
+
+
+def _pages(iam: Any, operation: str, **arguments: str) -> list[Any]:
+    """Return the pages of a listing; none if its subject does not exist any more."""
+    try:
+        return list(iam.get_paginator(operation).paginate(**arguments))
+    except ClientError as error:
+        if errors.code(error) != "NoSuchEntity":
+            raise
+        return []
+
+
+def _ignoring_absence(call: Callable[..., object], **arguments: str) -> None:
+    try:
+        call(**arguments)
+    except ClientError as error:
+        if errors.code(error) != "NoSuchEntity":
+            raise

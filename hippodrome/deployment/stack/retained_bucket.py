@@ -13,7 +13,6 @@ from hippodrome.control.aws import errors
 from hippodrome.control.model import ids
 from hippodrome.control.model.project import MASTER_LIST
 from hippodrome.deployment.aws.account import Account
-from hippodrome.deployment.aws.versions import VersionedBucket
 from hippodrome.deployment.stack import inventory
 from hippodrome.export import keys
 from hippodrome.export.bucket import Bucket
@@ -52,13 +51,6 @@ def open_bucket(account: Account, name: str, project: str) -> Bucket:
 def projects(account: Account, name: str) -> list[str]:
     """Return the projects, registered or not, that have documents of participants in this bucket."""
     return [project for project in _folders(account, name) if _holds(account, name, keys.prefix(project))]
-
-
-def older_versions(account: Account, name: str) -> bool:
-    """Whether the bucket has a version, current or not, of a document of any project's participants."""
-    bucket = VersionedBucket(account, name)
-    projects = filter(ids.is_project_id, bucket.folders())
-    return any(not version.marker for project in projects for version in bucket.versions(keys.prefix(project)))
 
 
 def _folders(account: Account, name: str) -> Iterator[str]:
