@@ -35,8 +35,6 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "AWS": {
         "deploy": ("deployment.lifecycle.deploy", "Put everything on AWS: installation, certificate, study"),
-        "plan": ("deployment.lifecycle.plan", "Show what would change in the installation"),
-        "apply": ("deployment.lifecycle.apply", "Make the installation, or bring it up to date"),
         "register": ("deployment.study.register", "Put a study on AWS, or its new version"),
         "secret": ("deployment.operate.secret", "Keep the key of a language model on AWS"),
         "certificate": ("deployment.stack.certificate", "Order or renew the servers' certificate"),

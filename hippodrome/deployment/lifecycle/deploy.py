@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -19,8 +20,9 @@ from hippodrome.deployment.core import explain, options, project_folder
 from hippodrome.deployment.core.explain import DENIED
 from hippodrome.deployment.core.finding import Finding, show
 from hippodrome.deployment.lifecycle import apply as applying
-from hippodrome.deployment.lifecycle import plan as plans
 from hippodrome.deployment.lifecycle import preflight
+from hippodrome.deployment.lifecycle.apply import ApplyRequest
+from hippodrome.deployment.lifecycle.plan import Plan
 from hippodrome.deployment.stack import certificate, certificate_transfer
 from hippodrome.deployment.stack.certificate import Choice, Report
 from hippodrome.deployment.stack.settings import StackSettings, taking_settings
@@ -88,36 +90,42 @@ def command(
         bool,
         typer.Option("--no-certificate", help="Order no certificate for servers now; until then no game works."),
     ] = False,
+    no_study: Annotated[bool, typer.Option("--no-study", help="Register no study: only the installation.")] = False,
     base: register.Base = "",
     stack: options.Stack = STACK,
     region: options.Region = None,
     profile: options.Profile = None,
     settings: StackSettings,
-    dry_run: options.DryRun = False,
+    plan: Annotated[
+        bool,
+        typer.Option("--plan", "--dry-run", help="Show what would change, and change nothing. Exit code 3: something."),
+    ] = False,
     yes: options.Yes = False,
     anyway: options.Anyway = False,
+    as_json: Annotated[bool, typer.Option("--json", help="With --plan: the answer as JSON, for scripts.")] = False,
 ) -> int:
     """Put everything on AWS: the installation, its certificate, and the study in FOLDER. What is there already stays.
+
+    Run it again after an update of Hippodrome, or to change a setting; options that are left out stay as they are. It
+    asks only before something would be lost.
 
     Without --domain the site has AWS's own address, and each server gets a certificate for its own. A domain (with a
     hosted zone in Route 53) gives both names, and is better for large studies. For researchers, who may not change the
     installation, it only registers the study.
     """
-    study, problem = _study(folder)
+    study, problem = (None, None) if no_study else _study(folder)
     earlier_findings = [preflight.of_problem("study", problem)] if problem else []
     account = _account(profile, region, earlier_findings)
-    if problem and (dry_run or describe_stack(account, stack)):
+    if problem and (plan or describe_stack(account, stack)):
         raise problem  # with an installation, the account needs no further check
-    if dry_run:
-        code = plans.run(account, stack, settings, False, study)
-        if study:
-            screen.info(f"Then {study.id} would be registered: `hippodrome register {folder} --dry-run` says how.")
-        return code
+    if plan:
+        return _plan(applying.plan(account, stack, settings, study), as_json)
+    screen.info(f"In account {account.id}, region {account.region}, as {account.identity['Arn'].rpartition(':')[2]}.")
     if may_apply(account, stack):
-        request = applying.ApplyRequest(study, earlier_findings, yes=yes, anyway=anyway)
+        request = ApplyRequest(study, earlier_findings, yes=yes, anyway=anyway)
         outcome = applying.apply(account, stack, settings, request)
         if outcome.changed:
-            applying.report(outcome, settings, False)
+            _report(outcome.outputs, settings.email)
         if not no_certificate and (settings.domain or outcome.outputs.get("RootDomain")):
             _certify(account, stack, study)
     else:
@@ -139,17 +147,36 @@ def _study(folder: Path) -> tuple[project_folder.ProjectFolder | None, Problem |
 
 
 def _account(profile: str | None, region: str | None, findings: list[Finding]) -> Account:
-    """Open the account and try its credentials. If they fail, show the findings in `known` first, then raise."""
+    """Open the account and try its credentials. If they fail, show the findings first, then raise."""
     try:
         account = open_account(profile, region)
-        user = account.identity["Arn"].rpartition(":")[2]
+        account.id  # noqa: B018 - raises at once if AWS does not accept the credentials
     except Exception as error:
         if problem := explain.problem_from(error):
             show(findings, screen.err)
             raise problem from None
         raise
-    screen.info(f"In account {account.id}, region {account.region}, as {user}.")
     return account
+
+
+def _plan(planned: Plan, as_json: bool) -> int:
+    """Print the plan with its findings, and return the command's exit code."""
+    if as_json:
+        screen.result_json(planned.as_json())
+    else:
+        applying.show(planned, answer=True)
+        show(planned.findings, screen.err)
+    return Exit.DONE if planned.kind == "nothing" else Exit.CHANGES
+
+
+def _report(outputs: Mapping[str, str], email: str | None) -> None:
+    """Print the participants' address, the researchers' policy, and whether a mail has to be confirmed."""
+    if site := outputs.get("Site"):
+        screen.result(f"{site}/next is where participants will go.")
+    if policy := outputs.get("ResearcherPolicy"):
+        screen.result(f"{policy} is the policy that researchers need.")
+    if email:
+        screen.warning(f"AWS has sent a mail to {email}: alarms come only after its link has been clicked.")
 
 
 def _certify(account: Account, stack: str, found: project_folder.ProjectFolder | None) -> None:

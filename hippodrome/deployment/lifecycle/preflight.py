@@ -6,8 +6,8 @@ prevent a first study is only worth a look. So is a check that these credentials
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, NamedTuple
 
 from botocore.exceptions import ClientError
@@ -16,12 +16,12 @@ from hippodrome.console import screen
 from hippodrome.console.formatting import count
 from hippodrome.console.problem import Problem
 from hippodrome.control.aws import errors
-from hippodrome.control.certificates.rules import names_of, proof_name
-from hippodrome.deployment.aws import caa, concurrency, public_access, quotas, regions
+from hippodrome.deployment.aws import concurrency, public_access, quotas, regions
 from hippodrome.deployment.aws.account import Account, other_installations, servers_domain, site_host
-from hippodrome.deployment.aws.hosted_zone import delegation, exists, leading_away, read_zone, record_in
+from hippodrome.deployment.aws.hosted_zone import read_zone, record_in
 from hippodrome.deployment.core.finding import Finding, Mark, bad, examine, look, show
-from hippodrome.deployment.stack import domain_change, inventory
+from hippodrome.deployment.core.server_records import Records
+from hippodrome.deployment.stack import domain, domain_change, inventory
 from hippodrome.deployment.stack.changes import Prepared
 
 if TYPE_CHECKING:
@@ -38,47 +38,47 @@ class AccountCheck(NamedTuple):
     study: ProjectFolder | None
 
 
-def check(
-    prepared: Prepared, study: ProjectFolder | None = None, wrong: Sequence[Finding] = (), *, anyway: bool = False
-) -> None:
-    """Check everything that is new or changes; show all findings, those in `wrong` included.
-
-    Raises `Problem` if one of them is bad, unless `anyway`.
-    """
-    _stop([*wrong, *look_at(prepared, study)], anyway)
-
-
-def check_account(account: Account, wrong: Sequence[Finding], study: ProjectFolder | None = None) -> None:
-    """Check the account before a first installation; show all findings. Raises `Problem` if one of them is bad."""
-    _stop([*wrong, *examine(AccountCheck(account, study), _OF_ACCOUNT)])
-
-
 def of_problem(name: str, problem: Problem) -> Finding:
     """Make a bad finding of a problem."""
     return bad(name, "\n    ".join([str(problem), *problem.details]), problem.advice)
 
 
-def look_at(prepared: Prepared, study: ProjectFolder | None = None) -> list[Finding]:
-    """Make all checks that apply, and return the findings that are not good, bad ones last. Changes nothing.
+def stop(findings: Iterable[Finding], *, anyway: bool = False) -> None:
+    """Show all findings, bad ones last. Raises `Problem` if one of them is bad, unless `anyway`."""
+    findings = _bad_last(findings)
+    show(findings, screen.err)
+    bads = sum(finding.mark is Mark.BAD for finding in findings)
+    if bads and not anyway:
+        raise Problem(
+            f"{count(bads, 'thing')} {'is' if bads == 1 else 'are'} in the way, marked ✗. Nothing was made or changed.",
+            "Put that right, and run the same command again.",
+        )
 
-    `study` is the study that will be registered in this installation.
-    """
+
+def look_at_account(account: Account, study: ProjectFolder | None) -> list[Finding]:
+    """Check the account before a first installation, for the `study` that will be registered."""
+    return examine(AccountCheck(account, study), _OF_ACCOUNT)
+
+
+def look_at(prepared: Prepared, study: ProjectFolder | None = None) -> list[Finding]:
+    """Check everything that is new or changes, and return the findings that are not good, bad ones last."""
     before, after = prepared.before, prepared.parameters
-    findings: list[Finding] = []
+    new_network = (before.get("VpcId") or "") != after["VpcId"]
+    new_site = (before.get("RootDomain"), before.get("SiteHost")) != (after["RootDomain"], after["SiteHost"])
     checks: dict[str, Callable[[Prepared], Iterable[Finding]]] = {}
-    if (before.get("RootDomain"), before.get("SiteHost")) != (after["RootDomain"], after["SiteHost"]):
-        checks |= _OF_ADDRESSES if after["RootDomain"] else {"servers": _servers_that_run}
-    if domain_change.moves(prepared) and after["RootDomain"]:
-        checks |= {"CAA": _authorities, "proof": _proof, "servers' names": _servers_names}
-    if (before.get("VpcId") or "") != after["VpcId"]:
+    if after["RootDomain"] and (new_site or domain_change.moves(prepared)):
+        checks |= {"domain": _domain, "other stacks": _other_stacks}
+    if after["RootDomain"] and new_site:
+        checks["site"] = _site
+    if prepared.existing is not None:
         checks["servers"] = _servers_that_run
-    if after["VpcId"] and (before.get("VpcId"), before.get("SubnetIds")) != (after["VpcId"], after["SubnetIds"]):
+    if after["VpcId"] and (new_network or before.get("SubnetIds") != after["SubnetIds"]):
         checks["network"] = _subnets
-    if prepared.existing is None or (before.get("VpcId") or "") != after["VpcId"]:
+    if prepared.existing is None or new_network:
         checks["Internet"] = _internet
     if prepared.existing is None:
         checks |= {"VPCs": _vpcs, "left over": _left_over}
-        findings = examine(AccountCheck(prepared.account, study), _OF_ACCOUNT)
+    findings = look_at_account(prepared.account, study) if prepared.existing is None else []
     findings += examine(prepared, checks)
     return _bad_last(finding for finding in findings if finding.mark is not Mark.GOOD)
 
@@ -86,16 +86,6 @@ def look_at(prepared: Prepared, study: ProjectFolder | None = None) -> list[Find
 def _bad_last(findings: Iterable[Finding]) -> list[Finding]:
     """Return the findings with the bad ones at the end, so that long remarks do not scroll them off the screen."""
     return sorted(findings, key=lambda finding: finding.mark is Mark.BAD)
-
-
-def _stop(findings: Sequence[Finding], anyway: bool = False) -> None:
-    show(_bad_last(findings), screen.err)
-    bads = sum(finding.mark is Mark.BAD for finding in findings)
-    if bads and not anyway:
-        raise Problem(
-            f"{count(bads, 'thing')} {'is' if bads == 1 else 'are'} in the way, marked ✗. Nothing was made or changed.",
-            "Put that right, and run the same command again.",
-        )
 
 
 # -- the account ------------------------------------------------------------------------------------------------------
@@ -106,13 +96,6 @@ def _region(checked: AccountCheck) -> Iterator[Finding]:
         regions.check(checked.account.region)
     except Problem as problem:
         yield of_problem("region", problem)
-
-
-def _root(checked: AccountCheck) -> Iterator[Finding]:
-    if checked.account.identity["Arn"].endswith(":root"):
-        yield look(
-            "credentials", "They are the root user's, who may do everything.", "Use a role or a user of your own."
-        )
 
 
 def _executions(checked: AccountCheck) -> Iterator[Finding]:
@@ -156,7 +139,6 @@ def _servers(checked: AccountCheck) -> Iterator[Finding]:
 
 _OF_ACCOUNT: Mapping[str, Callable[[AccountCheck], Iterable[Finding]]] = {
     "region": _region,
-    "credentials": _root,
     "Lambda": _executions,
     "Fargate": _servers,
 }
@@ -165,62 +147,10 @@ _OF_ACCOUNT: Mapping[str, Callable[[AccountCheck], Iterable[Finding]]] = {
 # -- the addresses ----------------------------------------------------------------------------------------------------
 
 
-def _delegation(prepared: Prepared) -> Iterator[Finding]:
-    """Check the zone's delegation. Without it the stack waits up to twelve hours for ACM, which asks DNS, and fails.
-
-    (aws-cloudformation/cloudformation-coverage-roadmap, issue 130; ACM's user guide, "Troubleshoot DNS validation".)
-    """
-    zone = read_zone(prepared.account, prepared.parameters["HostedZoneId"])
-    answer = delegation(zone)
-    servers = ", ".join(zone.name_servers)
-    if answer.problem and answer.certain:
-        yield bad(
-            "domain",
-            f"{answer.problem} No certificate can be issued for it, and its names cannot be resolved.",
-            f"Make these the name servers of {zone.domain}, where it is registered or in the zone above it: {servers}. "
-            "DNS knows them after minutes or hours; then run the same command again.",
-        )
-    elif answer.problem:
-        yield look("domain", answer.problem, f"Its name servers have to be {servers}.")
-
-
-def _proof(prepared: Prepared) -> Iterator[Finding]:
-    """Check that Let's Encrypt can see the zone's TXT record, by which an installation proves its servers' domain."""
-    zone = read_zone(prepared.account, prepared.parameters["HostedZoneId"])
-    proof = proof_name(servers_domain(prepared.parameters))
-    if away := leading_away(prepared.account, zone, proof):
-        name, kind = away
-        yield bad(
-            "domain",
-            f"The zone has a record {kind} of {name}, so no authority can see the proof that the servers' domain is "
-            f"yours: the TXT record {proof}.",
-            "Remove that record from the zone, or take another --servers.",
-        )
-
-
-def _authorities(prepared: Prepared) -> Iterator[Finding]:
-    """Check the CAA records, which must allow Amazon for the site and Let's Encrypt for the servers' names."""
+def _domain(prepared: Prepared) -> Iterator[Finding]:
     after = prepared.parameters
-    root, site, servers = after["RootDomain"], site_host(after), names_of(servers_domain(after))
-    exists_in_zone = partial(exists, prepared.account, read_zone(prepared.account, after["HostedZoneId"]))
-    wanted = [("Amazon", site, caa.AMAZON), *(("Let's Encrypt", name, caa.LETS_ENCRYPT) for name in servers)]
-    for issuer, name, authorities in wanted:
-        caa_records, wildcard = caa.find(name.removeprefix("*."), exists_in_zone), name.startswith("*.")
-        if not caa_records.certain:
-            yield look(
-                "CAA",
-                f"DNS could not be asked which authorities may issue certificates for {name}.",
-                "If the domain has no CAA records, nothing needs to be done. Otherwise try again on another network.",
-            )
-        elif forbidding := caa_records.forbidding(authorities, wildcard=wildcard, acme=authorities != caa.AMAZON):
-            place = root if root.endswith(f".{caa_records.where}") else caa_records.where
-            records = ", ".join(f'0 {tag} "{value}"' for tag, value in forbidding)
-            yield bad(
-                "CAA",
-                f"The CAA records of {caa_records.where} ({records}) keep {issuer} "
-                f"from issuing a certificate for {name}.",
-                f'Add two CAA records to {place}: 0 issue "{caa.AMAZON[0]}" and 0 issuewild "{caa.LETS_ENCRYPT[0]}".',
-            )
+    zone = read_zone(prepared.account, after["HostedZoneId"])
+    return domain.look_at(prepared.account, zone, servers_domain(after), site_host(after))
 
 
 def _site(prepared: Prepared) -> Iterator[Finding]:
@@ -241,24 +171,12 @@ def _site(prepared: Prepared) -> Iterator[Finding]:
         yield bad("site", f"API Gateway already serves {site} in this region, for something else.", advice)
 
 
-def _servers_names(prepared: Prepared) -> Iterator[Finding]:
-    try:
-        domain_change.check(prepared)
-    except Problem as problem:
-        yield of_problem("servers' names", problem)
-
-
-def _servers_that_run(prepared: Prepared) -> Iterator[Finding]:
-    """Check that no running server uses an address of the site, or a network, that is to be replaced."""
-    for check in (domain_change.check_site, domain_change.check_network):
-        try:
-            check(prepared)
-        except Problem as problem:
-            yield of_problem("servers", problem)
-
-
 def _other_stacks(prepared: Prepared) -> Iterator[Finding]:
-    """Check for other stacks with this domain: if both had the same study, its servers would have the same names."""
+    """Check the other installations, whose names must not meet this one's.
+
+    With the same domain and the same study, the servers of both would have the same names. And every agent can read the
+    key of the servers' certificate, which must not be valid for the site of another installation.
+    """
     name, root = prepared.stack.name, prepared.parameters["RootDomain"]
     for other, parameters in other_installations(prepared.account, name):
         if parameters.get("RootDomain") == root:
@@ -267,16 +185,42 @@ def _other_stacks(prepared: Prepared) -> Iterator[Finding]:
                 f"The stack {other} has the domain {root} as well: never register a project in both.",
                 f"A domain of its own, below that, is safer: --domain {name.lower()}.{root}",
             )
+        domains = servers_domain(prepared.parameters), parameters.get("RootDomain")
+        if "ServersHost" in parameters and (domains[0] == domains[1] or servers_domain(parameters) == root):
+            yield bad(
+                "servers' names",
+                f"The servers' certificate of one installation would be for the site of the other: this one and "
+                f"{other}.",
+                "Take another --domain or another --servers.",
+            )
 
 
-_OF_ADDRESSES: Mapping[str, Callable[[Prepared], Iterable[Finding]]] = {
-    "domain": _delegation,
-    "CAA": _authorities,
-    "proof": _proof,
-    "site": _site,
-    "servers": _servers_that_run,
-    "other stacks": _other_stacks,
-}
+def _servers_that_run(prepared: Prepared) -> Iterator[Finding]:
+    """Check that no server runs while its name, the site's, or the network is replaced.
+
+    No page could reach a server of the old domain, and its name would stay. CloudFormation deletes the site's old
+    address, at which participants have pages open, and the old network's route to the Internet. The API's own address
+    stays, so servers without names, and their pages, may run while a domain is added.
+    """
+    before, after = domain_change.present(prepared), prepared.parameters
+    if before is None:
+        return
+    changing = ["their network"] if (prepared.before.get("VpcId") or "") != after["VpcId"] else []
+    if before.has_domain and before.servers_domain != servers_domain(after):
+        changing.append(f"their names below {before.servers_domain}")
+    if before.has_domain and site_host(prepared.before) != site_host(after):
+        changing.append(f"the address of participants' pages, {site_host(prepared.before)}")
+    if not changing:
+        return
+    platform = prepared.account.platform(before)
+    if running := Records(platform.documents).open(platform.settings.max_runtime, datetime.now(UTC)):
+        yield bad(
+            "servers",
+            f"This would take away, while {count(len(running), 'server')} "
+            f"{'runs' if len(running) == 1 else 'run'}: {', '.join(changing)}.",
+            "Wait until they have ended, or end them with `hippodrome stop --all`; then deploy again. Warm servers end "
+            "for good when their study is closed (`hippodrome register --no-live`).",
+        )
 
 
 # -- the network, and what an earlier installation has left -----------------------------------------------------------
@@ -286,20 +230,20 @@ def _subnets(prepared: Prepared) -> Iterator[Finding]:
     after = prepared.parameters
     vpc, subnets = after["VpcId"], after["SubnetIds"].split(",")
     try:
-        found = prepared.account.client("ec2").describe_subnets(SubnetIds=subnets)["Subnets"]
+        described = prepared.account.client("ec2").describe_subnets(SubnetIds=subnets)["Subnets"]
     except ClientError as error:
         if errors.code(error) not in {"InvalidSubnetID.NotFound", "InvalidSubnetId.Malformed"}:
             raise
         yield bad("network", errors.message(error), "Check --subnets and --region.")
         return
-    for subnet in found:
+    for subnet in described:
         if subnet["VpcId"] != vpc:
             yield bad(
                 "network",
                 f"The subnet {subnet['SubnetId']} is in {subnet['VpcId']}, not in {vpc}.",
                 "Name a VPC and its own subnets: --vpc and --subnets.",
             )
-    if len({one.get("AvailabilityZone") for one in found}) < 2:
+    if len({subnet.get("AvailabilityZone") for subnet in described}) < 2:
         yield look(
             "network",
             "All those subnets are in one zone: when Spot runs out of room there, servers cost more.",
@@ -351,10 +295,8 @@ def _vpcs(prepared: Prepared) -> Iterator[Finding]:
 
 def _left_over(prepared: Prepared) -> Iterator[Finding]:
     """Check for log groups that an unfinished `destroy` has left: the stack cannot make groups of the same names."""
-    if prepared.found is not None:
-        return
     name = prepared.stack.name
-    if log_groups := inventory.log_groups(prepared.account, name):
+    if prepared.described is None and (log_groups := inventory.log_groups(prepared.account, name)):
         yield bad(
             "left over",
             f"An earlier installation {name} has left {count(len(log_groups), 'log group')}, such as {log_groups[0]}.",

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlsplit
@@ -27,21 +26,17 @@ from hippodrome.control.certificates.rules import (
     StoredCertificate,
     Verdict,
     names_of,
-    proof_name,
 )
 from hippodrome.deployment.aws import caa
 from hippodrome.deployment.aws.account import Account, Installation, find_installation, open_account
-from hippodrome.deployment.aws.hosted_zone import delegation, exists, leading_away, read_zone
+from hippodrome.deployment.aws.hosted_zone import read_zone
 from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import options
-from hippodrome.deployment.stack import certificate_transfer
+from hippodrome.deployment.core.finding import Mark
+from hippodrome.deployment.stack import certificate_transfer, domain
 
 if TYPE_CHECKING:
     from hippodrome.control.certificates.renewal import Renewal
-
-CAA_NAMES = {PRODUCTION: caa.LETS_ENCRYPT, STAGING: caa.LETS_ENCRYPT}
-"""By ACME directory, the names by which CAA records allow its authority to issue."""
-_UNKNOWN_AUTHORITY = ("<the authority>",)
 
 REAL = "hippodrome certificate --production"
 _MAX_BUNDLE = 1_000_000  # bytes
@@ -202,7 +197,6 @@ def renewal_of(
     """Make the service that renews the installation's certificate, and the request to it for this choice."""
     from hippodrome.control.certificates.renewal import Renewal
 
-    domain = installation.servers_domain
     platform = account.platform(installation)
     renewal = Renewal(
         platform.documents,
@@ -214,7 +208,9 @@ def renewal_of(
     )
     directory = choice.directory or renewal.last_directory() or STAGING
     trusted = choice.trusted or renewal.last_roots(directory)
-    return renewal, RenewalRequest(domain, directory, choice.email, trusted, choice.force, choice.seconds)
+    return renewal, RenewalRequest(
+        installation.servers_domain, directory, choice.email, trusted, choice.force, choice.seconds
+    )
 
 
 # ---- before an order
@@ -226,48 +222,19 @@ def check(account: Account, installation: Installation, directory: str, own: boo
     `own` says that the directory belongs to an authority of one's own, which may use another DNS. Then only the zone is
     checked. If DNS cannot be asked about the delegation, this only warns.
     """
-    domain = installation.servers_domain
+    servers = installation.servers_domain
     zone = read_zone(account, installation["HostedZoneId"])
-    if not zone.holds(domain):
+    if not zone.holds(servers):
         raise Problem(
-            f"The hosted zone {zone.id} is for {zone.domain}, and {domain} does not lie in it.",
-            "Give the zone of your domain: `hippodrome apply --zone …`.",
+            f"The hosted zone {zone.id} is for {zone.domain}, and {servers} does not lie in it.",
+            "Give the zone of your domain: `hippodrome deploy --zone …`.",
         )
     if own:
         return
-    servers = delegation(zone)
-    if servers.problem and not servers.certain:
-        screen.warning(servers.problem)
-    elif servers.problem:
-        raise Problem(
-            f"{servers.problem} So no authority can see that it is yours.",
-            f"At the registrar of {zone.domain} (or in the zone above it), enter these name servers; then wait until "
-            "that is known, which may take some hours.",
-            zone.name_servers,
-        )
-    proof = proof_name(domain)
-    if away := leading_away(account, zone, proof):
-        name, kind = away
-        raise Problem(
-            f"The hosted zone {zone.id} has a record {kind} of {name}, so no authority can see the proof, which is the "
-            f"TXT record {proof}.",
-            "Remove that record from the zone, or let the servers' names lie elsewhere: `hippodrome apply "
-            "--servers …`.",
-        )
-    if authorities := CAA_NAMES.get(directory):
-        _check_caa(domain, authorities, partial(exists, account, zone))
-
-
-def _check_caa(domain: str, authorities: tuple[str, ...], exists: Callable[[str], bool]) -> None:
-    """Raise `Problem` if a CAA record forbids the order: Let's Encrypt would refuse it, and count a failure."""
-    for name in names_of(domain):
-        record = caa.find(name.removeprefix("*."), exists)
-        if forbidding := record.forbidding(authorities, wildcard=name.startswith("*."), acme=True):
-            raise Problem(
-                f"A CAA record of {record.where} does not let {authorities[0]} issue certificates for {name}.",
-                f'Add a CAA record to {record.where}: 0 issuewild "{authorities[0]}".',
-                [f'{record.where} CAA 0 {tag} "{value}"' for tag, value in forbidding],
-            )
+    for finding in domain.look_at(account, zone, servers, any_caa=directory not in (PRODUCTION, STAGING)):
+        if finding.mark is Mark.BAD:
+            raise Problem(finding.text, finding.advice)
+        screen.warning(finding.text)
 
 
 # ---- the options
@@ -341,6 +308,7 @@ def _obstacle(decision: Decision, stored: StoredCertificate | None) -> Problem:
 
 def _problem(error: OrderFailed, wish: RenewalRequest) -> Problem:
     authority, message = _authority(wish.directory), str(error)
+    caa_name = caa.LETS_ENCRYPT[0] if wish.directory in (PRODUCTION, STAGING) else "<the authority>"
     sentences: dict[FailureReason, tuple[str, str]] = {
         FailureReason.VALIDATION: (
             f"{authority} could not see the proof in DNS.",
@@ -348,7 +316,7 @@ def _problem(error: OrderFailed, wish: RenewalRequest) -> Problem:
         ),
         FailureReason.CAA: (
             f"A CAA record of {wish.domain}, or of a domain above it, forbids {authority} to issue.",
-            f'Add the record 0 issuewild "{CAA_NAMES.get(wish.directory, _UNKNOWN_AUTHORITY)[0]}" and run this again.',
+            f'Add the record 0 issuewild "{caa_name}" and run this again.',
         ),
         FailureReason.RATE_LIMITED: (
             f"{authority} wants no further orders{_until(error.until)}.",

@@ -16,7 +16,7 @@ from botocore.exceptions import ClientError
 from hippodrome.console.problem import Problem
 from hippodrome.control.aws import errors
 from hippodrome.deployment.aws import regions
-from hippodrome.deployment.aws.account import Account, parameters_of
+from hippodrome.deployment.aws.account import Account, is_no_stack, parameters_of
 from hippodrome.deployment.aws.resource_names import TAG
 from hippodrome.deployment.code import build
 from hippodrome.deployment.code.packages import Target
@@ -37,7 +37,7 @@ class Prepared:
 
     account: Account
     stack: Stack
-    found: Mapping[str, Any] | None  # the stack from DescribeStacks; None if there is none
+    described: Mapping[str, Any] | None  # the stack, as DescribeStacks returns it; None if there is none
     template: Template
     functions: Sequence[build.Function]
     parameters: Mapping[str, str]
@@ -46,13 +46,13 @@ class Prepared:
     @property
     def status(self) -> str:
         """The stack's state; empty if there is no stack."""
-        return str(self.found["StackStatus"]) if self.found else ""
+        return str(self.described["StackStatus"]) if self.described else ""
 
     @property
     def existing(self) -> Mapping[str, Any] | None:
         """The stack from DescribeStacks; None if there is none, or if it was never complete."""
         makes = states.action_for(self.status) in {StackAction.CREATE, StackAction.RECREATE}
-        return None if makes else self.found
+        return None if makes else self.described
 
     @cached_property
     def before(self) -> dict[str, str]:
@@ -201,6 +201,22 @@ def _findings(client: Any, change_set: ChangeSet, mode: str) -> list[str]:
                 and event.get("ValidationStatus", "FAILED") == "FAILED"  # and not SKIPPED
             ]
     return sentences[:5]
+
+
+def delete_old_change_sets(prepared: Prepared) -> None:
+    """Delete change sets that an interrupted run left behind."""
+    if not prepared.described:
+        return
+    client = prepared.account.client("cloudformation")
+    try:
+        pages = client.get_paginator("list_change_sets").paginate(StackName=prepared.stack.name)
+        for summary in [summary for page in pages for summary in page["Summaries"]]:
+            ours = summary["ChangeSetName"].startswith(PREFIX)
+            if ours and summary.get("ExecutionStatus") != "EXECUTE_IN_PROGRESS":
+                client.delete_change_set(ChangeSetName=summary["ChangeSetId"], StackName=prepared.stack.name)
+    except ClientError as error:
+        if not is_no_stack(error):
+            raise
 
 
 def _discard(client: Any, change_set: ChangeSet, prepared: Prepared) -> None:

@@ -65,11 +65,6 @@ def action_for(status: str) -> StackAction:
     return ACTIONS.get(status, StackAction.STOP) if status else StackAction.CREATE
 
 
-def never_complete(status: str) -> bool:
-    """Whether a stack in this state was never complete, so that it can only be deleted."""
-    return action_for(status) is StackAction.RECREATE
-
-
 def problem(stack: str, status: str) -> Problem:
     """Explain a state of a stack that `apply` leaves to the administrator."""
     because = _BECAUSE.get(status, "is in a state that this version does not know")
