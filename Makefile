@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 HIPPODROME = HIPPODROME_STACK="$(STACK)" $(BIN)/python -m hippodrome
-# `plan` and --dry-run end with 3 if they have found something to do, which is no error.
+# --plan and --dry-run end with 3 if they have found something to do, which is no error.
 FOUND = || { code=$$?; [ $$code -eq 3 ] || exit $$code; }
 PROJECT ?=
 DATA ?=
@@ -69,14 +69,15 @@ erase: $(VENV)/deploy ## erase one participant, USER_ID=, from the data of PROJE
 logs: $(VENV)/deploy ## show the logs of functions and servers (ARGS=--errors)
 stop: $(VENV)/deploy ## stop every server now, or those of PROJECT=
 destroy: $(VENV)/deploy ## remove the installation; the data stay
-deploy register cost: TOLD = $(STUDY)
+deploy plan register cost: TOLD = $(STUDY)
 deploy plan: TOLD += $(call option,DOMAIN,domain) $(call option,EMAIL,email)
+plan: TOLD += --plan
 doctor status logs stop: TOLD = $(or $(STUDY),--all)
 data: TOLD = $(STUDY) $(call option,DATA,from)
 erase: TOLD = $(call option,DATA,from)
 erase: WHO = -- "$(USER_ID)" $(STUDY)
 deploy plan register secret certificate doctor status cost data erase logs stop destroy:
-	@$(HIPPODROME) $@ $(TOLD) $(ARGS) $(WHO) $(FOUND)
+	@$(HIPPODROME) $(subst plan,deploy,$@) $(TOLD) $(ARGS) $(WHO) $(FOUND)
 
 WORKERS ?=
 # Many tests wait for processes, so two cores have four workers. `loadscope` gives a worker the tests of a module.

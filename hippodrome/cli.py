@@ -86,7 +86,7 @@ def _problem_from(error: Exception, command: str) -> Problem | None:
     if isinstance(error, ModuleNotFoundError):
         of_aws = command in GROUPS["AWS"] or command == "links" or error.name in ("boto3", "botocore")
         extra = "aws" if of_aws else "data"
-        target = "plan" if command in ("apply", "links") else command  # these two have no target of their own
+        target = "plan" if command == "links" else command  # it has no target of its own
         return Problem(
             f"`hippodrome {command}` needs the package {error.name}, which is not installed.",
             f'Install it with `pip install "hippodrome[{extra}]"`; in a clone, `make {target}` does.',

@@ -12,7 +12,7 @@ class Exit(IntEnum):
     DONE = 0
     FAILED = 1  # a Problem, which was printed
     MISUSE = 2  # the command line has a mistake, or does not say which of two things is meant
-    CHANGES = 3  # `plan` and `--dry-run`: there are changes to make
+    CHANGES = 3  # `deploy --plan` and `--dry-run`: there are changes to make
     DECLINED = 4  # the answer to a question was no; nothing was changed
     INTERRUPTED = 130  # Ctrl-C; the next run continues
 

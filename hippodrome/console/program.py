@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 COMMANDS = (
-    *("new", "check", "run", "try", "gym", "data", "erase", "links", "deploy", "plan", "apply", "register"),
+    *("new", "check", "run", "try", "gym", "data", "erase", "links", "deploy", "register"),
     *("secret", "certificate", "doctor", "status", "cost", "logs", "stop", "destroy"),
 )
 """The names of all commands (hippodrome/cli.py)."""

@@ -1,4 +1,4 @@
-"""An AWS account on ministack, with the installation that `hippodrome apply` makes in it.
+"""An AWS account on ministack, with the installation that `hippodrome deploy` makes in it.
 
 The gaps between ministack and AWS are named here and in `emulator.py`, each beside its bridge (search for "Gap:").
 """

@@ -15,7 +15,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
-from email.utils import format_datetime
 from typing import Any
 
 from botocore.exceptions import ClientError
@@ -132,8 +131,7 @@ class FakeCloudFormation:
 
     def list_stacks(self) -> Any:
         found = [*([self.stack] if self.stack else []), *(stack for stack, _, _ in self.past)]
-        headers = {"date": format_datetime(self.clock())} if self.clock else {}
-        return {"StackSummaries": [dict(one) for one in found], "ResponseMetadata": {"HTTPHeaders": headers}}
+        return {"StackSummaries": [dict(one) for one in found]}
 
     def get_template(self, StackName: str, TemplateStage: str = "Original") -> Any:
         self.calls.append(("get_template", {}))
@@ -260,6 +258,8 @@ class FakeCloudFormation:
         status, events = step() if callable(step) else step
         before = self.stack["StackStatus"]
         self.stack["StackStatus"] = status
+        if status == "DELETE_COMPLETE" and self.clock:
+            self.stack["DeletionTime"] = self.clock()
         if status != before:
             self._event(self.stack["StackName"], "AWS::CloudFormation::Stack", status, "")
         for logical, kind, state, reason in events:

@@ -1,6 +1,6 @@
 """A stack whose resources are real things in moto, and whose deletion is refused where AWS refuses it.
 
-Facts, each with its source where the code has it (`hippodrome/deployment/stack/deletion.py`, `acm_records.py`, `cooldown.py`):
+Facts, each with its source where the code has it (`hippodrome/deployment/stack/deletion.py`, `acm_records.py` and `hippodrome/deployment/lifecycle/apply.py`):
 a certificate stays in use after API Gateway's domain; its validation record is nobody's; an attached policy is not
 deleted; interfaces of tasks outlive them; a queue is listed for a minute after it was deleted, and its name is kept.
 """

@@ -18,8 +18,7 @@ from hippodrome.deployment.aws.hosted_zone import Delegation
 from hippodrome.deployment.code import build
 from hippodrome.deployment.code.packages import ZipMember
 from hippodrome.deployment.code.template import Template
-from hippodrome.deployment.lifecycle import preflight
-from hippodrome.deployment.stack import changes, stack
+from hippodrome.deployment.stack import changes, domain, stack
 from testing.botocore_sessions import botocore_session
 from tests.deployment.fake_cloudformation import FakeCloudFormation, refusal
 
@@ -188,8 +187,8 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
         world = World()
         monkeypatch.setattr(changes.Template, "read", lambda: Template(world.text))
         monkeypatch.setattr(build, "functions", lambda target: world.functions)
-        monkeypatch.setattr(preflight, "delegation", lambda zone: world.delegated)
-        monkeypatch.setattr(preflight.caa, "find", lambda name, *_: world.caa.get(name, caa.Caa()))
+        monkeypatch.setattr(domain, "delegation", lambda zone: world.delegated)
+        monkeypatch.setattr(caa, "find", lambda name, *_: world.caa.get(name, caa.Caa()))
         monkeypatch.setattr(stack.time, "sleep", lambda seconds: None)
         monkeypatch.setattr(stack, "FIRST_PAUSE", 0.0)
         # Gap: moto ignores the conditions of bucket policies, so the one against plain HTTP would refuse every request.

@@ -38,7 +38,7 @@ def make(*arguments: str, **environment: str) -> str:
             ("deploy", "PROJECT=../a", "DOMAIN=a.org", "EMAIL=me@a.org"),
             'deploy "../a/" --domain "a.org" --email "me@a.org"',
         ),
-        (("plan", "PROJECT=../a", "DOMAIN=a.org"), 'plan --domain "a.org"'),
+        (("plan", "PROJECT=../a", "DOMAIN=a.org"), 'deploy "../a/" --domain "a.org" --plan'),
     ],
 )
 def test_variables_reach_the_command(arguments: tuple[str, ...], wanted: str) -> None:

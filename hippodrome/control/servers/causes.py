@@ -83,8 +83,8 @@ _EXPLANATIONS = {
     Cause.INITIALISATION: _Explanation(
         FailureCategory.INITIALISATION,
         "ECS could not prepare the container: its log group, its secrets, or the login to the image's registry.",
-        "`hippodrome plan` shows what is missing and `apply` puts it back; `hippodrome doctor --all` says whether a "
-        "study's LLM_KEY is missing. With a network of your own, see whether its subnets reach the Internet.",
+        "`hippodrome deploy --plan` shows what is missing and `deploy` puts it back; `hippodrome doctor --all` says "
+        "whether a study's LLM_KEY is missing. With a network of your own, see whether its subnets reach the Internet.",
     ),
     Cause.CANNOT_BEGIN: _Explanation(
         FailureCategory.PROGRAM,
@@ -105,13 +105,13 @@ _EXPLANATIONS = {
         FailureCategory.REFUSED,
         "The server is not allowed to listen on its port.",
         "Register the project again, which makes a task definition that allows it; if it stays, "
-        "`hippodrome apply --port 5000`, and register once more.",
+        "`hippodrome deploy --port 5000`, and register once more.",
     ),
     Cause.NO_CERTIFICATE: _Explanation(
         FailureCategory.REFUSED,
         "The server got no certificate for its address from Let's Encrypt, in three tries.",
         "`hippodrome doctor --all` says how many orders are left; letsencrypt.status.io says whether it works. "
-        "With a domain (`hippodrome apply --domain`) servers need no certificates of their own.",
+        "With a domain (`hippodrome deploy --domain`) servers need no certificates of their own.",
     ),
     Cause.CRASHED: _Explanation(
         FailureCategory.PROGRAM,
@@ -136,8 +136,9 @@ _EXPLANATIONS = {
     Cause.PERMISSION: _Explanation(
         FailureCategory.REFUSED,
         "AWS does not allow the installation to run servers.",
-        "`hippodrome plan` shows which role has changed and `apply` puts it back. AWS blocks Fargate in some new "
-        "accounts: start the smallest EC2 instance, end it, and try again after some hours, or ask its Support Center.",
+        "`hippodrome deploy --plan` shows which role has changed and `deploy` puts it back. AWS blocks Fargate in some "
+        "new accounts: start the smallest EC2 instance, end it, and try again after some hours, or ask its Support "
+        "Center.",
     ),
     Cause.SIZE: _Explanation(
         FailureCategory.REFUSED,

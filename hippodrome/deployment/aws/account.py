@@ -149,7 +149,7 @@ class Installation:
         except KeyError:
             raise Problem(
                 f"The stack {self.stack} has no output {output}.",
-                "Bring it up to date with `hippodrome deploy` or `hippodrome apply`.",
+                "Bring it up to date with `hippodrome deploy`.",
             ) from None
 
     @property
@@ -282,7 +282,7 @@ def find_installation(account: Account, stack: str = STACK) -> Installation:
     if status == "DELETE_FAILED":
         raise Problem(f"The stack {stack} is half deleted ({status}).", "Finish it with `hippodrome destroy`.")
     if status in {"ROLLBACK_COMPLETE", "ROLLBACK_FAILED", "CREATE_FAILED"}:
-        raise Problem(f"The stack {stack} is in {status}: it does not work.", "Run `hippodrome apply` to repair it.")
+        raise Problem(f"The stack {stack} is in {status}: it does not work.", "Run `hippodrome deploy` to repair it.")
     if status == "CREATE_IN_PROGRESS" or status.startswith(("ROLLBACK_IN", "DELETE_IN")):
         raise Problem(f"The stack {stack} is in {status}.", "Wait until CloudFormation is done, and try again.")
     return Installation.of(account, found)

@@ -26,8 +26,7 @@ def present(prepared: Prepared) -> Installation | None:
 
 def moves(prepared: Prepared) -> bool:
     """Whether servers' names move to another domain. It is True, too, if there is no installation yet."""
-    before = present(prepared)
-    return before is None or before.servers_domain != servers_domain(prepared.parameters)
+    return not prepared.before or servers_domain(prepared.before) != servers_domain(prepared.parameters)
 
 
 def certify(prepared: Prepared) -> None:

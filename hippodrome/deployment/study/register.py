@@ -312,11 +312,11 @@ def invoke(account: Account, installation: Installation, registration: Mapping[s
 def _advice(problems: Sequence[str]) -> str:
     """Advise on these problems. A function that does not know a key is older than this version."""
     if not problems:
-        return "Bring it up to date with `hippodrome apply`."
+        return "Bring it up to date with `hippodrome deploy`."
     if any("unknown key" in problem for problem in problems):
         return (
-            "The installation is older than this study: bring it up to date with `hippodrome deploy` "
-            "(or `hippodrome apply`), or ask your administrator to. Then run this again."
+            "The installation is older than this study: bring it up to date with `hippodrome deploy`, "
+            "or ask your administrator to. Then run this again."
         )
     return "Correct this and run it again."
 

@@ -10,9 +10,9 @@ import pytest
 from hippodrome import cli
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.deployment.lifecycle import apply as applying
+from hippodrome.deployment.lifecycle import deploy
 from hippodrome.deployment.lifecycle import plan as plans
-from hippodrome.deployment.lifecycle.apply import ApplyRequest, apply
-from hippodrome.deployment.lifecycle.plan import plan
+from hippodrome.deployment.lifecycle.apply import ApplyRequest, apply, plan
 from hippodrome.deployment.stack.changes import Prepared
 from hippodrome.deployment.stack.settings import StackSettings
 from tests.deployment.fake_cloudformation import NOTHING, changed_resource, happy, invalid, refusal
@@ -34,7 +34,6 @@ def test_the_first_apply_creates_the_stack(world: World, capsys: pytest.CaptureF
     world.cloud.outputs = OUTPUTS
     outcome = apply(world.account, "hippodrome", FIRST)
     assert outcome.changed
-    assert outcome.created
     assert outcome.outputs == OUTPUTS
     (asked,) = world.cloud.called("create_change_set")
     assert asked["ChangeSetType"] == "CREATE"
@@ -149,7 +148,7 @@ def test_warnings_of_validation_are_shown_and_do_not_stop_apply(
         invalid("Sweep", "may be looked at by nobody", "WARN", "SKIPPED"),
         invalid("Vpc", "the quota is used up", "WARN"),
     ]
-    assert apply(world.account, "hippodrome", FIRST).created
+    assert apply(world.account, "hippodrome", FIRST).changed
     said = capsys.readouterr().err
     assert "CloudFormation warns of Vpc: the quota is used up" in said
     assert "nobody" not in said
@@ -179,27 +178,10 @@ def test_a_failed_creation_is_reported_and_the_next_run_creates_the_stack(world:
     assert "--vpc" in caught.value.advice
     first = world.cloud.stack["StackId"]
     outcome = apply(world.account, "hippodrome", AGAIN)  # the domain is remembered
-    assert outcome.created
+    assert outcome.changed
     assert world.cloud.called("delete_stack")
     assert world.cloud.stack["StackId"] != first
     assert world.cloud.stack["StackStatus"] == "CREATE_COMPLETE"
-
-
-@pytest.mark.parametrize("status", ["ROLLBACK_COMPLETE", "ROLLBACK_FAILED", "CREATE_FAILED"])
-def test_empty_buckets_of_a_failed_creation_are_deleted_and_full_ones_kept(world: World, status: str) -> None:
-    s3 = world.account.client("s3")
-    for name in ("empty", "full"):
-        s3.create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": REGION})
-    s3.put_object(Bucket="full", Key="data", Body=b"x")
-    world.stand(status)
-    world.cloud.resources = [
-        {"LogicalResourceId": "Bucket", "PhysicalResourceId": name, "ResourceType": "AWS::S3::Bucket"}
-        for name in ("empty", "full", "gone")
-    ]
-    assert apply(world.account, "hippodrome", AGAIN).created
-    left = {bucket["Name"] for bucket in s3.list_buckets()["Buckets"]}
-    assert "full" in left
-    assert "empty" not in left
 
 
 def test_a_failed_update_is_reported_with_its_cause(world: World, capsys: pytest.CaptureFixture[str]) -> None:
@@ -239,7 +221,7 @@ def test_apply_waits_for_an_operation_in_progress(world: World, capsys: pytest.C
 def test_a_stack_in_review_is_used(world: World) -> None:
     world.stand("REVIEW_IN_PROGRESS")
     outcome = apply(world.account, "hippodrome", FIRST)
-    assert outcome.created
+    assert outcome.changed
     assert world.cloud.called("create_change_set")[0]["ChangeSetType"] == "CREATE"
 
 
@@ -349,10 +331,10 @@ def test_a_plan_of_an_update_leaves_no_change_set(world: World) -> None:
     assert len(found.dangers) == 1
     assert len(world.cloud.called("delete_change_set")) == 1
     assert not world.cloud.called("execute_change_set")
-    text = [line for line, _ in plans.lines(found)]
+    text = [line for line, _ in found.lines()]
     assert "  MaxRuntime: 120 → 30" in text
     assert "  ~ new code: sweep" in text
-    assert "  ~ next_step (function) Code, Timeout" in text
+    assert "  ~ next_step (Lambda Function) Code, Timeout" in text
     assert any("running servers are lost" in line for line in text)
 
 
@@ -373,40 +355,53 @@ def test_a_plan_without_changes_says_so(world: World) -> None:
 
 @pytest.fixture
 def command(world: World, monkeypatch: pytest.MonkeyPatch) -> Any:
-    for module in (plans, applying):
-        monkeypatch.setattr(module, "open_account", lambda profile, region: world.account)
-    return lambda *arguments: cli.main(list(arguments))
+    """Runs `hippodrome deploy` for the installation alone. Ordering certificates has tests of its own."""
+    monkeypatch.setattr(deploy, "open_account", lambda profile, region: world.account)
+    return lambda *arguments: cli.main(["deploy", "--no-study", "--no-certificate", *arguments])
 
 
-def test_plan_and_apply_have_their_exit_codes(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command("plan", "--domain", DOMAIN) == Exit.CHANGES
-    assert command("apply", "--domain", DOMAIN, "--dry-run") == Exit.CHANGES
+def test_plan_and_deploy_have_their_exit_codes(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command("--plan", "--domain", DOMAIN) == Exit.CHANGES
+    assert command("--dry-run", "--domain", DOMAIN) == Exit.CHANGES
     assert not world.cloud.calls
-    assert command("apply", "--domain", DOMAIN) == Exit.DONE
+    assert command("--domain", DOMAIN) == Exit.DONE
     world.cloud.text = world.built.text
-    assert command("plan") == Exit.DONE
-    assert command("apply", "--dry-run") == Exit.DONE
-    assert command("plan", "--max-runtime", "4") == 2
-    assert command("plan", "--domain", "no domain") == Exit.FAILED
+    assert command("--plan") == Exit.DONE
+    assert command("--plan", "--max-runtime", "4") == 2
+    assert command("--plan", "--domain", "no domain") == Exit.FAILED
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_plan_and_apply_answer_in_json(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    world.cloud.outputs = OUTPUTS
-    command("plan", "--domain", DOMAIN, "--json")
+def test_the_plan_of_a_new_stack_names_functions_and_counts_the_rest(
+    world: World, command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command("--plan", "--domain", DOMAIN)
+    assert capsys.readouterr().out.splitlines() == [
+        "The stack hippodrome in ca-central-1 will be made:",
+        "  + 2 functions: next_step, sweep",
+        "  + 3 other resources: 1 S3 Bucket, 1 EC2 VPC, 1 SNS Topic",
+        "Participants will open https://study.example.org/next",
+    ]
+
+
+def test_the_plan_can_be_had_in_json(world: World, command: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    command("--plan", "--domain", DOMAIN, "--json")
     found = json.loads(capsys.readouterr().out)
     assert found["kind"] == "create"
     assert {"action": "create", "name": "sweep"}.items() <= found["changes"][-2].items()
-    command("apply", "--domain", DOMAIN, "--json")
-    found = json.loads(capsys.readouterr().out)
-    assert found["changed"] is True
-    assert found["outputs"] == OUTPUTS
+    world.cloud.text, world.cloud.outputs = world.built.text, OUTPUTS
+    world.stand()
+    world.account.client("s3").create_bucket(
+        Bucket=world.code_bucket, CreateBucketConfiguration={"LocationConstraint": REGION}
+    )
+    command("--plan", "--max-runtime", "30", "--json")
+    assert json.loads(capsys.readouterr().out)["parameters"] == {"MaxRuntime": {"before": "120", "after": "30"}}
 
 
-def test_apply_says_that_the_address_for_alarms_has_to_be_confirmed(
+def test_deploy_says_that_the_address_for_alarms_has_to_be_confirmed(
     world: World, command: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command("apply", "--domain", DOMAIN, "--email", "me@example.org")
+    command("--domain", DOMAIN, "--email", "me@example.org")
     said = " ".join(capsys.readouterr().err.split())
     assert "AWS has sent a mail to me@example.org: alarms come only after its link has been clicked." in said
 

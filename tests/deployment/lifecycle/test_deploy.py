@@ -67,7 +67,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def apply(account: Any, stack: str, settings: Any, wish: ApplyRequest) -> ApplyOutcome:
         assert not wish.wrong
         done.append(f"apply {settings.domain}")
-        return ApplyOutcome(True, 1.0, outputs={"Site": "https://study.example.org", "RootDomain": "example.org"})
+        return ApplyOutcome(True, {"Site": "https://study.example.org", "RootDomain": "example.org"})
 
     def register(folder: Path, **options: Any) -> int:
         done.append(f"register {folder.name}" + (f" on {options['base']}" if options["base"] else ""))

@@ -16,7 +16,7 @@ from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.model import ids
 from hippodrome.deployment.lifecycle.apply import apply
 from hippodrome.deployment.lifecycle.destroy import Removal
-from hippodrome.deployment.stack import cooldown, inventory
+from hippodrome.deployment.stack import inventory
 from hippodrome.deployment.stack.code_bucket import CodeBucket
 from hippodrome.deployment.stack.settings import StackSettings
 from testing.exploration import sample
@@ -220,7 +220,7 @@ def test_apply_waits_until_the_names_of_deleted_queues_are_free(
 
     stack.cloud.validation = taken  # CloudFormation validates when it makes the change set
     outcome = apply(stack.world.account, "hippodrome", StackSettings(domain=DOMAIN))
-    assert outcome.created
+    assert outcome.changed
     assert 60 <= (stack.clock.time - gone).total_seconds() <= 80
     assert "AWS keeps the names of deleted queues" in capsys.readouterr().err
 
@@ -234,16 +234,21 @@ def test_timers_that_are_still_being_deleted_are_waited_for(
     taken = invalid("ScheduleGroup", "hippodrome already exists")
     world.cloud.validation = lambda: [taken] if clock.slept < 30 else []
     monkeypatch.setattr(world.account.client("scheduler"), "get_schedule_group", get, raising=False)
-    assert apply(world.account, "hippodrome", StackSettings(domain=DOMAIN)).created
+    assert apply(world.account, "hippodrome", StackSettings(domain=DOMAIN)).changed
     assert clock.slept == 30
     assert "still deleting the timers" in capsys.readouterr().err
 
 
 def test_queues_that_were_deleted_over_a_minute_ago_are_not_waited_for(stack: RealStack) -> None:
+    stack.in_use = 0
     removal = Removal(stack.world.account, "hippodrome")
     removal.run(removal.look(), data=False)
+    assert stack.cloud.stack
+    stack.cloud.stack["DeletionTime"] -= timedelta(seconds=stack.clock.slept + 70)
     stack.clock.sleep(70)
-    assert cooldown.remaining(stack.world.account, "hippodrome") == 0
+    before = stack.clock.slept
+    assert apply(stack.world.account, "hippodrome", StackSettings(domain=DOMAIN)).changed
+    assert stack.clock.slept == before
 
 
 def test_a_code_bucket_that_s3_is_still_deleting_is_waited_for(
@@ -312,7 +317,7 @@ def test_apply_waits_for_the_remains_of_a_failed_creation(stack: RealStack, caps
     for group in inventory.log_groups(stack.world.account, "hippodrome"):
         stack.client("logs").delete_log_group(logGroupName=group)
     outcome = apply(stack.world.account, "hippodrome", StackSettings(domain=DOMAIN))
-    assert outcome.created
+    assert outcome.changed
     assert stack.clock.slept >= 40 * 60
     assert "10 to 60 minutes" in capsys.readouterr().err
 

@@ -17,10 +17,8 @@ from hippodrome.deployment.aws.hosted_zone import Delegation, Zone, delegation
 from hippodrome.deployment.core import project_folder
 from hippodrome.deployment.core.finding import Finding, Mark
 from hippodrome.deployment.lifecycle import apply as applying
-from hippodrome.deployment.lifecycle import plan as plans
 from hippodrome.deployment.lifecycle import preflight
-from hippodrome.deployment.lifecycle.apply import ApplyRequest, apply
-from hippodrome.deployment.lifecycle.plan import plan
+from hippodrome.deployment.lifecycle.apply import ApplyRequest, apply, plan
 from hippodrome.deployment.stack.changes import prepare
 from hippodrome.deployment.stack.settings import StackSettings
 from tests.certificate.nameserver import SERVFAIL, answering, ask_only
@@ -139,16 +137,16 @@ def test_a_plan_of_an_update_shows_its_problems(world: World) -> None:
 
 def test_a_plan_names_the_address_that_participants_will_open(world: World) -> None:
     """With DOMAIN=study.example.org the plan shows the second `study` in the address before it is made."""
-    first = [line for line, _ in plans.lines(plan(world.account, "hippodrome", FIRST))]
+    first = [line for line, _ in plan(world.account, "hippodrome", FIRST).lines()]
     assert f"Participants will open https://study.{DOMAIN}/next" in first
     apply(world.account, "hippodrome", FIRST)
-    moved = [line for line, _ in plans.lines(plan(world.account, "hippodrome", StackSettings(site="lab")))]
+    moved = [line for line, _ in plan(world.account, "hippodrome", StackSettings(site="lab")).lines()]
     assert f"Participants will open https://lab.{DOMAIN}/next" in moved
 
 
 def test_problems_can_be_overruled(world: World, capsys: Capsys) -> None:
     world.delegated = NOBODY
-    assert apply(world.account, "hippodrome", FIRST, ApplyRequest(anyway=True)).created
+    assert apply(world.account, "hippodrome", FIRST, ApplyRequest(anyway=True)).changed
     assert "✗ domain" in capsys.readouterr().err
 
 
@@ -162,7 +160,7 @@ def test_problems_can_be_overruled(world: World, capsys: Capsys) -> None:
 )
 def test_a_check_without_permission_is_a_remark(world: World, capsys: Capsys, operation: str, check: str) -> None:
     world.limits.denied.add(operation)
-    assert apply(world.account, "hippodrome", FIRST).created
+    assert apply(world.account, "hippodrome", FIRST).changed
     said = capsys.readouterr().err
     assert f"! {check}: could not be checked: These credentials may not " in said
 
@@ -186,11 +184,6 @@ def test_a_region_without_a_needed_service_is_a_problem(world: World, capsys: Ca
     found = only([one for one in findings(world) if one.mark is Mark.BAD])
     assert "cannot be installed in ap-southeast-7" in found.text
     assert "ap-southeast-1" in found.advice
-
-
-def test_the_root_user_is_a_remark(world: World) -> None:
-    world.account.identity = {"Account": world.account.id, "Arn": f"arn:aws:iam::{world.account.id}:root"}
-    assert (only(findings(world)).mark, only(findings(world)).check) == (Mark.LOOK, "credentials")
 
 
 def test_few_executions_are_a_remark_that_says_how_they_are_divided(world: World) -> None:
@@ -282,7 +275,7 @@ def test_a_record_that_hides_the_proof_of_the_servers_domain_is_a_problem(world:
     found = only(findings(world))
     assert found.mark is Mark.BAD
     assert (
-        f"The zone has a record {kind} of _acme-challenge.servers.{DOMAIN}, so no authority can see the proof"
+        f"The hosted zone has a record {kind} of _acme-challenge.servers.{DOMAIN}, so no authority can see the proof"
         in found.text
     )
 
@@ -560,7 +553,7 @@ def test_an_existing_or_forbidden_role_of_ecs_is_not_waited_for(
         raise ClientError({"Error": {"Code": code, "Message": "taken"}}, "CreateServiceLinkedRole")
 
     monkeypatch.setattr(world.account.client("iam"), "create_service_linked_role", refuse, raising=False)
-    assert apply(world.account, "hippodrome", FIRST).created
+    assert apply(world.account, "hippodrome", FIRST).changed
     assert waits == []
 
 
@@ -568,7 +561,7 @@ def test_a_creation_that_failed_because_ecs_does_not_know_its_role_is_repeated(
     world: World, waits: list[float]
 ) -> None:
     world.cloud.operations = [list(UNKNOWN_ROLE), [("DELETE_IN_PROGRESS", []), ("DELETE_COMPLETE", [])]]
-    assert apply(world.account, "hippodrome", FIRST).created
+    assert apply(world.account, "hippodrome", FIRST).changed
     assert waits == [10, 10]
     assert world.cloud.stack is not None
     assert world.cloud.stack["StackStatus"] == "CREATE_COMPLETE"

@@ -8,8 +8,7 @@ import botocore.session
 import pytest
 
 from hippodrome.console.problem import Problem
-from hippodrome.deployment.lifecycle import plan as plans
-from hippodrome.deployment.lifecycle.apply import apply
+from hippodrome.deployment.lifecycle.apply import apply, plan
 from hippodrome.deployment.stack import states
 from hippodrome.deployment.stack.settings import StackSettings
 from hippodrome.deployment.stack.states import StackAction
@@ -94,7 +93,7 @@ def apply_again(world: World) -> Any:
 def test_from_any_state_plan_gives_a_plan_or_a_problem_with_advice(world: World, status: str) -> None:
     world.stand(status)
     try:
-        found = plans.plan(world.account, "hippodrome", FIRST)
+        found = plan(world.account, "hippodrome", FIRST)
     except Problem as problem:
         assert states.action_for(status) in {
             StackAction.WAIT,

@@ -146,7 +146,7 @@ def test_a_refusal_is_told_at_once(there: Registry, file: Path) -> None:
     there.fails(99, "POST", 403)
     with pytest.raises(Problem, match=r"refused a request for study \(HTTP 403\)") as caught:
         Repository(there.address, "study", "secret").push(BLOB, file)
-    assert "hippodrome apply" in caught.value.advice
+    assert "hippodrome deploy" in caught.value.advice
     assert len(there.asked) == 1
     with pytest.raises(Problem) as caught:
         Repository(there.address, "study").push(BLOB, file)

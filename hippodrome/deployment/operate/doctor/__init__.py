@@ -41,9 +41,9 @@ def stack_state(context: CheckContext) -> Iterator[Finding]:
         yield good("stack", f"{name} is in {status}.")
     elif status == "UPDATE_ROLLBACK_COMPLETE":
         text = f"{name} works as before its last update, which failed."
-        yield look("stack", text, "`hippodrome plan` says whether something is still to be changed.")
+        yield look("stack", text, "`hippodrome deploy --plan` says whether something is still to be changed.")
     else:
-        yield look("stack", f"{name} is in {status}.", "`hippodrome apply` finishes or repairs what was begun.")
+        yield look("stack", f"{name} is in {status}.", "`hippodrome deploy` finishes or repairs what was begun.")
 
 
 def version(context: CheckContext) -> Iterator[Finding]:
@@ -53,7 +53,7 @@ def version(context: CheckContext) -> Iterator[Finding]:
     present = Stack(context.account, context.installation.stack).template()
     if present and _plain(present) != _plain(Template.read().for_region(context.account.region).text):
         text = "The stack was made by another version of this command."
-        yield look("version", text, "`hippodrome plan` shows what differs.")
+        yield look("version", text, "`hippodrome deploy --plan` shows what differs.")
 
 
 def _plain(template: str) -> str:

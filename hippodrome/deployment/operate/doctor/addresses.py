@@ -26,7 +26,7 @@ from hippodrome.deployment.operate import snapshot
 from hippodrome.deployment.operate.doctor.check_context import CheckContext
 from hippodrome.deployment.stack.stack import Stack
 
-DOMAIN = "With a domain there is no such limit: `hippodrome apply --domain …`."
+DOMAIN = "With a domain there is no such limit: `hippodrome deploy --domain …`."
 PATIENCE = 10  # seconds to wait for the site
 
 
@@ -39,12 +39,12 @@ def zone(context: CheckContext) -> Iterator[Finding]:
         zone = read_zone(context.account, context.installation["HostedZoneId"])
     except Problem as problem:
         yield bad(
-            "hosted zone", str(problem), "The servers' names are written there: run `hippodrome apply` with --zone."
+            "hosted zone", str(problem), "The servers' names are written there: run `hippodrome deploy` with --zone."
         )
         return
     if not zone.holds(domain):
         text = f"{zone.id} is for {zone.domain}, not for {domain}."
-        yield bad("hosted zone", text, "Give `hippodrome apply` its zone.")
+        yield bad("hosted zone", text, "Give `hippodrome deploy` its zone.")
         return
     if context.delegation is None:
         yield good("hosted zone", f"{zone.domain} ({zone.id}); DNS was not asked.")
@@ -64,7 +64,7 @@ def site_certificate(context: CheckContext) -> Iterator[Finding]:
     stack = Stack(context.account, context.installation.stack)
     arns = stack.ids_of("AWS::CertificateManager::Certificate")
     if not arns and context.installation.has_domain:
-        yield look("site certificate", "The stack has none.", "Bring it up to date with `hippodrome apply`.")
+        yield look("site certificate", "The stack has none.", "Bring it up to date with `hippodrome deploy`.")
     for arn in arns:
         certificate = context.account.client("acm").describe_certificate(CertificateArn=arn)["Certificate"]
         status, name = certificate["Status"], certificate["DomainName"]
@@ -74,7 +74,7 @@ def site_certificate(context: CheckContext) -> Iterator[Finding]:
             advice = "It is issued as soon as the domain is delegated to the hosted zone."
             yield bad("site certificate", f"{name}: waits for its validation in DNS.", advice)
         else:
-            advice = "See it in the ACM console, then run `hippodrome apply`."
+            advice = "See it in the ACM console, then run `hippodrome deploy`."
             yield bad("site certificate", f"{name}: {status}.", advice)
 
 

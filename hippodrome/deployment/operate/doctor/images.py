@@ -38,7 +38,7 @@ def _project(context: CheckContext, project: Project) -> Iterator[Finding]:
         yield look(
             check,
             f"maxRuntime is {project.max_runtime} minutes{waits}; the installation stops servers after {allowed}.",
-            f"Give `hippodrome apply` --max-runtime {needed}, or register the project with a shorter maxRuntime"
+            f"Give `hippodrome deploy` --max-runtime {needed}, or register the project with a shorter maxRuntime"
             f"{' or warmServers: 0' if warm else ''}.",
         )
     if not project.task_definition:

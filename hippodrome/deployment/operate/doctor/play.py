@@ -215,7 +215,7 @@ class Play:
         statuses = [reply.status for reply in self._ask(unsigned, f"{unsigned}&signature={other.rpartition('=')[2]}")]
         if not all(400 <= status < 500 for status in statuses):
             text = f"A link without its own signature was answered with {statuses}."
-            raise CheckFailed(text, "Run `hippodrome apply`.")
+            raise CheckFailed(text, "Run `hippodrome deploy`.")
         return f"Without a signature: {statuses[0]}; with another's: {statuses[1]}."
 
     def _walk(self) -> str:
@@ -441,7 +441,7 @@ class Play:
         cloudwatch = account.client("cloudwatch")
         quiet = [alarm for alarm in snapshot.alarms(account, installation) if alarm["StateValue"] != "ALARM"]
         if not quiet:
-            raise CheckFailed("There is no alarm that is quiet.", "Run `hippodrome apply`, or see which alarms fire.")
+            raise CheckFailed("There is no alarm that is quiet.", "Run `hippodrome deploy`, or see which alarms fire.")
         alarm = min(quiet, key=lambda candidate: str(candidate["AlarmName"]))
         name, began = alarm["AlarmName"], datetime.now(UTC) - timedelta(seconds=5)
 
@@ -463,7 +463,7 @@ class Play:
         if not confirmed:
             raise CheckFailed(
                 "An alarm was set off and reached its topic, which has no subscriber.",
-                "Give `hippodrome apply` an --email, and follow the link in AWS's e-mail.",
+                "Give `hippodrome deploy` an --email, and follow the link in AWS's e-mail.",
                 Mark.LOOK,
             )
         whom = f"{len(confirmed)} {'address' if len(confirmed) == 1 else 'addresses'}"

@@ -13,7 +13,7 @@ from hippodrome.deployment.core.finding import Finding, bad, good, look
 from hippodrome.deployment.operate import snapshot
 from hippodrome.deployment.operate.doctor.check_context import CheckContext
 
-APPLY = "Run `hippodrome apply`: it puts this right."
+APPLY = "Run `hippodrome deploy`: it puts this right."
 
 
 def bucket(context: CheckContext) -> Iterator[Finding]:
@@ -110,4 +110,4 @@ def listeners(context: CheckContext) -> Iterator[Finding]:
     if confirmed:
         yield good("alarm e-mail", f"Alarms go to {', '.join(confirmed)}.")
     elif not pending:
-        yield look("alarm e-mail", "The alarms have no subscriber.", "Give `hippodrome apply` an --email.")
+        yield look("alarm e-mail", "The alarms have no subscriber.", "Give `hippodrome deploy` an --email.")

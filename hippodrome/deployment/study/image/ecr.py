@@ -69,7 +69,7 @@ class ImageRepository:
             if errors.code(error) != "RepositoryNotFoundException":
                 raise
             raise Problem(
-                f"The repository {self.name} is not there any more.", "Run `hippodrome apply` to make it again."
+                f"The repository {self.name} is not there any more.", "Run `hippodrome deploy` to make it again."
             ) from None
         return Images(self.uri, sorted(tagged_images))
 

@@ -43,7 +43,7 @@ _ADVICE: tuple[tuple[str, str], ...] = (
     ),
     (
         r"denied|403 Forbidden|not authorized",
-        "Run it again. If it fails again, ask the administrator to run `hippodrome apply`.",
+        "Run it again. If it fails again, ask the administrator to run `hippodrome deploy`.",
     ),
 )
 

@@ -188,7 +188,7 @@ class Repository:
     def _refused(self, status: int, text: str) -> Problem:
         what = f"{self._host} refused a request for {self.name} (HTTP {status})."
         advice = (
-            "Run it again. If it fails again, ask the administrator to run `hippodrome apply`."
+            "Run it again. If it fails again, ask the administrator to run `hippodrome deploy`."
             if self._ours
             else "Correct the name of the base. If it needs a login, add --docker: the builder knows your logins."
         )
