@@ -125,6 +125,7 @@ class Removal:
     def plan(self, found: Found, data: bool) -> list[PlanStep]:
         """Plan the steps in their order: the stack, the resources outside of it, and with `data` also the data."""
         steps = [step(self._prepare_stack, found.stack), step(self._remember, found)] if found.stack else []
+        steps += [step(inventory.mark, self.account, bucket, self.name) for bucket in found.data]
         steps += [step(self._delete_stack, found)]
         steps += [step(self._acme_records, addresses) for addresses in found.addresses]
         steps += [step(self._validation_records), step(self._task_definitions), step(self._log_groups)]

@@ -102,8 +102,8 @@ def _created(changes: Sequence[Change]) -> Iterator[tuple[str, str]]:
     functions = sorted(change.name for change in changes if change.type == "AWS::Lambda::Function")
     yield f"  + {len(functions)} functions: {', '.join(functions)}", "green"
     kinds = Counter(change.kind for change in changes if change.type != "AWS::Lambda::Function")
-    listed = ", ".join(f"{number} {kind}" for kind, number in kinds.most_common())
-    yield f"  + {kinds.total()} other resources: {listed}", "green"
+    listed = ", ".join(f"{number} {kind}" for kind, number in kinds.most_common(5))
+    yield f"  + {kinds.total()} other resources: {listed}{' …' if len(kinds) > 5 else ''}", "green"
 
 
 def _changed(changes: Sequence[Change]) -> Iterator[tuple[str, str]]:

@@ -121,14 +121,30 @@ def data_buckets(account: Account, stack: str, remembered: Iterable[str] = ()) -
 
 def _belongs(account: Account, bucket: str, stack: str) -> bool:
     """Whether the bucket has the stack's tag and is in this region. Another region may have a stack of this name."""
-    s3, owned = account.client("s3"), {"Bucket": bucket, "ExpectedBucketOwner": account.id}
+    if _tags(account, bucket).get(TAG) != stack:
+        return False
+    place = account.client("s3").get_bucket_location(Bucket=bucket, ExpectedBucketOwner=account.id)
+    return (place.get("LocationConstraint") or "us-east-1") == account.region
+
+
+def mark(account: Account, bucket: str, stack: str) -> None:
+    """Give the bucket the stack's tag if it has none, so that it can be found when CloudFormation forgets the stack.
+
+    CloudFormation puts the stack's tags on it; some emulators do not.
+    """
+    tags = _tags(account, bucket)
+    if TAG not in tags and bucket_exists(account, bucket):
+        tag_set = [{"Key": key, "Value": value} for key, value in (tags | {TAG: stack}).items()]
+        s3 = account.client("s3")
+        s3.put_bucket_tagging(Bucket=bucket, ExpectedBucketOwner=account.id, Tagging={"TagSet": tag_set})
+
+
+def _tags(account: Account, bucket: str) -> dict[str, str]:
     try:
-        tags = s3.get_bucket_tagging(**owned)["TagSet"]
+        answer = account.client("s3").get_bucket_tagging(Bucket=bucket, ExpectedBucketOwner=account.id)
     except ClientError:  # it has no tags, or belongs to others
-        return False
-    if {"Key": TAG, "Value": stack} not in tags:
-        return False
-    return (s3.get_bucket_location(**owned).get("LocationConstraint") or "us-east-1") == account.region
+        return {}
+    return {tag["Key"]: tag["Value"] for tag in answer["TagSet"]}
 
 
 def bucket_exists(account: Account, name: str) -> bool:

@@ -105,46 +105,37 @@ class StackSettings:
     ) -> dict[str, str]:
         """Make the template's parameters: of each the option, else the stack's present value, else the default.
 
-        `subnets` are the present installation's. Raises `Problem` if a value is missing, or values do not fit together.
+        `subnets` are the present installation's. Raises `Problem` if values do not fit together.
         """
-        values_given = {name: value for name, value in defaults.items() if value is not None}
-        values_given |= {name: value for name, value in previous.items() if name in defaults}
-        for setting, parameter in _PARAMETERS.items():
-            value = getattr(self, setting)
-            if value is not None:
-                if parameter not in defaults:
-                    raise Problem(
-                        f"The template has no parameter {parameter} for --{setting.replace('_', '-')}.",
-                        "Leave that option out, or take infra/template.yml from the repository again.",
-                    )
-                values_given[parameter] = str(value).strip()
-        if values_given.get("SiteHost") and values_given.get("SiteHost") == values_given.get("ServersHost"):
+        given = {parameter: getattr(self, setting) for setting, parameter in _PARAMETERS.items()}
+        values = {name: value for name, value in defaults.items() if value is not None}
+        values |= {name: value for name, value in previous.items() if name in defaults}
+        values |= {name: str(value).strip() for name, value in given.items() if value is not None}
+        if values.get("SiteHost") and values.get("SiteHost") == values.get("ServersHost"):
             raise Problem(
-                f"--site and --servers are both {values_given['SiteHost']}.",
+                f"--site and --servers are both {values['SiteHost']}.",
                 "Servers get their names beside the site: give two.",
             )
-        values_given["SubnetIds"] = ",".join(
-            part.strip() for part in values_given.get("SubnetIds", "").split(",") if part.strip()
-        )
-        if bool(values_given.get("VpcId")) != bool(values_given["SubnetIds"]):
+        values["SubnetIds"] = ",".join(filter(None, map(str.strip, values.get("SubnetIds", "").split(","))))
+        if bool(values.get("VpcId")) != bool(values["SubnetIds"]):
             raise Problem(
                 "--vpc and --subnets go together.", "Give both, or both as '' for a VPC of the installation's."
             )
-        values_given |= self._addresses(account, previous) | {"CodeBucket": code_bucket}
-        limit = concurrency.unreserved_or_none(account) if concurrency.PARAMETER in defaults else None
-        if limit is not None:
-            values_given |= concurrency.parameters(limit)
-        if values_given["RootDomain"]:
-            _check_site(site_host(values_given))
-        if set(availability_zones.PARAMETERS) <= set(defaults):
-            values_given |= _zones(account, values_given, previous, subnets)
-        missing = sorted(set(defaults) - set(values_given))
-        if missing:
+        values |= self._addresses(account, previous) | {"CodeBucket": code_bucket}
+        if (limit := concurrency.unreserved_or_none(account)) is not None:
+            values |= concurrency.parameters(limit)
+        site = site_host(values)
+        if len(site) > SITE_LENGTH:
             raise Problem(
-                f"The template wants values that no option gives: {', '.join(missing)}.",
-                "Give these parameters a Default in infra/template.yml, or take the file from the repository again.",
+                f"The site's address would have {len(site)} characters ({site}); AWS's certificates allow "
+                f"{SITE_LENGTH}.",
+                "Choose a shorter --site or --domain.",
             )
-        return {name: value for name, value in values_given.items() if name in defaults}
+        if values.get("VpcId"):  # the zones stay, unused, for a later VPC of its own
+            values |= {name: previous.get(name, "") for name in availability_zones.PARAMETERS}
+        elif set(availability_zones.PARAMETERS) <= set(defaults):
+            values |= availability_zones.choose(account, previous, () if previous.get("VpcId") else subnets)
+        return {name: value for name, value in values.items() if name in defaults}
 
     def _addresses(self, account: Account, previous: Mapping[str, str]) -> dict[str, str]:
         before = previous.get("RootDomain", "")
@@ -164,23 +155,6 @@ class StackSettings:
         if domain == before and previous.get("HostedZoneId"):
             return {"RootDomain": domain, "HostedZoneId": previous["HostedZoneId"]}
         return {"RootDomain": domain, "HostedZoneId": find_zone(account, domain).id}
-
-
-def _check_site(site: str) -> None:
-    if len(site) > SITE_LENGTH:
-        raise Problem(
-            f"The site's address would have {len(site)} characters ({site}); AWS's certificates allow {SITE_LENGTH}.",
-            "Choose a shorter --site or --domain.",
-        )
-
-
-def _zones(
-    account: Account, found: Mapping[str, str], previous: Mapping[str, str], subnets: Sequence[str]
-) -> dict[str, str]:
-    """Return the parameters for zones. With a VPC of the administrator's they stay, unused, for a later own VPC."""
-    if found.get("VpcId"):
-        return {name: previous.get(name, "") for name in availability_zones.PARAMETERS}
-    return availability_zones.choose(account, previous, () if previous.get("VpcId") else subnets)
 
 
 def taking_settings(command: Callable[..., int]) -> Callable[..., int]:

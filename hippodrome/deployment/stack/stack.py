@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -107,11 +107,18 @@ class Stack:
     def ids_of(self, kind: str) -> list[str]:
         """Return the physical ids of the stack's existing resources of a type; empty if there is no stack."""
         try:
-            return ids_of(self.resources(), kind)
+            resources = self.resources()
         except ClientError as error:
             if is_no_stack(error):
                 return []
             raise
+        return [
+            str(resource["PhysicalResourceId"])
+            for resource in resources
+            if resource["ResourceType"] == kind
+            and resource.get("PhysicalResourceId")
+            and resource.get("ResourceStatus") not in {"DELETE_COMPLETE", "DELETE_SKIPPED"}
+        ]
 
     def last_event(self, stack_id: str) -> str:
         """Return the id of the stack's newest event, by which `follow` recognises later ones; "" if there is none."""
@@ -149,7 +156,11 @@ class Stack:
             if operation.failures and not failed:
                 failed = True
                 screen.warning(f"{operation.failures[0].logical_id} failed: {operation.failures[0].reason}")
-            if not waited and time.monotonic() - began > LONG_FOR_A_CERTIFICATE and _makes_certificate(operation):
+            if (
+                not waited
+                and time.monotonic() - began > LONG_FOR_A_CERTIFICATE
+                and any("ertificate" in name for name in operation.under_way)
+            ):
                 waited = True
                 screen.warning(
                     "The certificate is waiting for DNS: it comes only if the domain is delegated to the zone."
@@ -218,18 +229,13 @@ class Stack:
         self.attach()
         stack = self.describe()
         status = str(stack["StackStatus"]) if stack else ""
-        act = states.action_for(status)
-        if act is StackAction.STOP:
+        action = states.action_for(status)
+        if action is StackAction.STOP:
             raise states.problem(self.name, status)
-        if stack and act in {StackAction.ROLL_BACK, StackAction.CONTINUE}:
-            self._take_back(stack, act)
-
-    def _take_back(self, stack: Mapping[str, Any], act: StackAction) -> None:
-        """Roll back an update that failed, or go on with a rollback that failed."""
-        if act is StackAction.ROLL_BACK:
-            screen.info(
-                f"An update of {self.name} failed and was left as it is ({stack['StackStatus']}): back to before."
-            )
+        if stack is None or action not in {StackAction.ROLL_BACK, StackAction.CONTINUE}:
+            return
+        if action is StackAction.ROLL_BACK:
+            screen.info(f"An update of {self.name} failed and was left as it is ({status}): back to before.")
             begin = self._client.rollback_stack
         else:
             screen.info(f"An earlier update of {self.name} could not be taken back: CloudFormation tries again.")
@@ -289,22 +295,6 @@ class Stack:
             reason = (describe_stack(self._account, stack_id) or {}).get("StackStatusReason", "")
             details = [str(reason)] if reason else []
         return Problem(f"{summary} (now {status}).", advice(failures, details), details)
-
-
-def ids_of(resources: Iterable[Mapping[str, Any]], kind: str) -> list[str]:
-    """Return the physical ids of the resources that have this type and exist."""
-    deleted = {"DELETE_COMPLETE", "DELETE_SKIPPED"}
-    return [
-        str(resource["PhysicalResourceId"])
-        for resource in resources
-        if resource["ResourceType"] == kind
-        and resource.get("PhysicalResourceId")
-        and resource.get("ResourceStatus") not in deleted
-    ]
-
-
-def _makes_certificate(operation: Operation) -> bool:
-    return any("ertificate" in name for name in operation.under_way)
 
 
 _ADVICE = (  # a pattern for the reason of a failure, and the advice; the first that fits counts

@@ -236,6 +236,15 @@ def test_other_installations_are_not_touched(installed: World, monkeypatch: pyte
     assert buckets(installed) == {"hippodrome-lab-bucket-1", "hippodrome-bucket-elsewhere", "hippodrome-notes"}
 
 
+def test_a_bucket_without_our_tag_gets_it_before_the_stack_is_deleted(installed: World) -> None:
+    s3 = installed.account.client("s3")
+    s3.put_bucket_tagging(Bucket=DATA, Tagging={"TagSet": [{"Key": "owner", "Value": "lab"}]})
+    removal = Removal(installed.account, "hippodrome", Executor(lambda _: None))
+    removal.run(removal.look(), data=False)
+    tags = {tag["Key"]: tag["Value"] for tag in s3.get_bucket_tagging(Bucket=DATA)["TagSet"]}
+    assert tags == {"owner": "lab", "hippodrome:stack": "hippodrome"}
+
+
 def test_a_dry_run_changes_nothing(
     installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
