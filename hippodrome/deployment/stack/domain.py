@@ -42,8 +42,8 @@ def _delegation(zone: Zone) -> Iterator[Finding]:
         yield bad(
             "domain",
             f"{answer.problem} No certificate can be issued for it, and its names cannot be resolved.",
-            f"Make these the name servers of {zone.domain}, where it is registered or in the zone above it: {servers}. "
-            "DNS knows them after minutes or hours; then run the same command again.",
+            f"At the registrar of {zone.domain} (or in the zone above it), enter these name servers: {servers}. DNS "
+            "knows them after minutes or hours; then run the same command again.",
         )
     elif answer.problem:
         yield look("domain", answer.problem, f"Its name servers have to be {servers}.")
