@@ -209,7 +209,7 @@ def _wait_for_names(account: Account, name: str, executor: Executor) -> None:
         except ClientError:  # there is none, or these credentials may not look: CloudFormation will say
             return False
 
-    executor.wait(deleting, TIMERS, title="EventBridge is still deleting the timers of an earlier stack")
+    executor.wait(deleting, TIMERS, pause=5, title="EventBridge is still deleting the timers of an earlier stack")
     deleted = [stack["DeletionTime"] for stack in inventory.summaries(account, name) if "DeletionTime" in stack]
     since = (datetime.now(UTC) - max(deleted)).total_seconds() if deleted else QUEUE_NAME
     if since < QUEUE_NAME:
