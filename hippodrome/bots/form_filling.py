@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from datetime import date, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from math import floor
 from random import Random
@@ -49,7 +48,6 @@ _PATTERNS = (
     "ABC123",
     "a1b2",
 )
-_EPOCH = datetime(1970, 1, 1)
 
 
 def fill(form: Form, random: Random) -> Pairs:
@@ -204,55 +202,10 @@ def _on_grid(low: Decimal | None, high: Decimal | None, base: Decimal, step: Dec
     return base + step * (random.randint(first, last) if first <= last else 0)
 
 
-def _moment_text(control: Control, random: Random) -> str:
-    """A date, time, month or week within its limits, a whole number of steps from its base."""
-    kind = control.kind
-    unit = _SECONDS[kind]
-    low, high = _moment(kind, control.attributes.get("min")), _moment(kind, control.attributes.get("max"))
-    step = decimal_of(control.attributes.get("step"))
-    length = unit * (step if step is not None and step > 0 else Decimal(60 if unit == 1 else 1))
-    if kind == "time":
-        low = Decimal(0) if low is None else low
-        high = Decimal(86399) if high is None or high < low else high  # high < low: a span over midnight
-    elif low is None and high is None:
-        low = _moment(kind, _DEFAULT_LOW[kind])
-    value = _moment(kind, control.attributes.get("value"))
-    base = low if control.attributes.get("min") and low is not None else value if value is not None else Decimal(0)
-    if kind == "week" and low is None and value is None:
-        base = Decimal(4 * 86400)  # the first Monday after 1970 began
-    seconds = _on_grid(low, high, base, length, random)
-    return _to_text(kind, int(seconds))
-
-
-def _moment(kind: str, text: str | None) -> Decimal | None:
-    """Seconds since 1970 began, or months for the kind `month`; None if the text is no time of this kind."""
-    if not text:
-        return None
-    try:
-        if kind == "month":
-            day = date.fromisoformat(f"{text}-01")
-            return Decimal((day.year - 1970) * 12 + day.month - 1)
-        if kind == "week":
-            text = f"{text}-1"
-        if kind == "time":
-            text = f"1970-01-01T{text}"
-        return Decimal(int((datetime.fromisoformat(text) - _EPOCH).total_seconds()))
-    except (ValueError, OverflowError):
-        return None
-
-
-def _to_text(kind: str, count: int) -> str:
-    """The text of which `_moment` reads this number: a date, a time, a month (`count`: months) or a week."""
-    if kind == "month":
-        return f"{1970 + count // 12:04d}-{count % 12 + 1:02d}"
-    moment = _EPOCH + timedelta(seconds=count)
-    if kind == "date":
-        return moment.date().isoformat()
-    if kind == "week":
-        year, week, _ = moment.isocalendar()
-        return f"{year:04d}-W{week:02d}"
-    clock = moment.strftime("%H:%M:%S" if moment.second else "%H:%M")
-    return clock if kind == "time" else f"{moment.date().isoformat()}T{clock}"
+def _moment(control: Control, random: Random) -> str:
+    """A date, time, month or week: the first within its limits, from which HTML counts its steps."""
+    limits = (control.attributes.get(name) for name in ("min", "max", "value"))
+    return next(filter(None, limits), _MOMENTS[control.kind])
 
 
 def decimal_of(text: str | None) -> Decimal | None:
@@ -268,8 +221,13 @@ def _whole(text: str | None) -> int | None:
     return int(text) if text and text.isdecimal() else None
 
 
-_SECONDS = {"date": 86400, "time": 1, "datetime-local": 1, "month": 1, "week": 7 * 86400}
-_DEFAULT_LOW = {"date": "2024-02-29", "datetime-local": "2024-02-29T12:00", "month": "2024-02", "week": "2024-W09"}
+_MOMENTS = {
+    "date": "2024-02-29",
+    "time": "12:34",
+    "datetime-local": "2024-02-29T12:34",
+    "month": "2024-02",
+    "week": "2024-W09",
+}
 _GENERATORS = {
     "text": _phrase,
     "search": _phrase,
@@ -281,7 +239,7 @@ _GENERATORS = {
     "color": _color,
     "number": _number,
     "range": _number,
-    **dict.fromkeys(_SECONDS, _moment_text),
+    **dict.fromkeys(_MOMENTS, _moment),
 }
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from hippodrome.control.config import Config, Diagnostic, layout
 from hippodrome.local.backend.files import names
 from hippodrome.local.backend.retry import message_for
-from hippodrome.local.check.project import check_project
+from hippodrome.local.check.command import check_project
 from hippodrome.local.publish import NotPublished, step_files
 
 _GONE = (FileNotFoundError, NotADirectoryError)

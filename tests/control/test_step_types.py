@@ -18,7 +18,7 @@ from hippodrome.control.participants.path import Stop
 from hippodrome.control.participants.steps.page import PageStep
 from hippodrome.control.participants.visit import Visit
 from hippodrome.functions import installed as place
-from hippodrome.local.check.project import check_project
+from hippodrome.local.check.command import check_project
 from testing.studies import installed, study
 from tests.control.participants.test_journey import Browser
 

@@ -13,9 +13,6 @@ from hippodrome.local.check.wording import short
 from hippodrome.protocol.similar import SIMILAR, did_you_mean
 from hippodrome.trial.agent.signatures import NAMES
 
-_METHODS = ("start", "step", "render", "reset", "close", "feedback", "to_act")
-_SIMILAR_METHODS = 0.8  # as similar as `rest` and `reset`: a class may have methods for itself
-
 
 def label_of(folder: Path) -> str | None:
     """Return the path of agent.py from the project's folder, as messages name it; None if there is no agent.py."""
@@ -42,47 +39,25 @@ def read_agent(folder: Path) -> list[Diagnostic]:
 
 
 def never_called(folder: Path, config: Config) -> list[Diagnostic]:
-    """Return remarks on methods that are never called.
-
-    These are a method whose name is nearly that of one that is called, a method `on_…` that is not a callback, and a
-    function `match` that config.yml does not ask for.
-    """
+    """Return remarks on methods `on_…` that are no callbacks, and on a `match` that config.yml does not ask for."""
     path, label = layout.agent_folder(folder) / AGENT, label_of(folder) or AGENT
     try:
         tree = ast.parse(path.read_bytes())
     except (OSError, ValueError, SyntaxError):
         return []
     used = {part.attr for part in ast.walk(tree) if isinstance(part, ast.Attribute)}
-    used |= {part.id for part in ast.walk(tree) if isinstance(part, ast.Name)}
-    classes = [part for part in tree.body if isinstance(part, ast.ClassDef) and part.name == "Agent"]
-    methods = [method for class_node in classes for method in _unused_functions(class_node.body, used)]
-    members = {part.name for class_node in classes for part in class_node.body if isinstance(part, ast.FunctionDef)}
-    methods_found = [(method.lineno, _nearly_called(method.name, members)) for method in methods]
-    if config.project.has_sessions and config.project.matching != MATCH:
+    used |= {part.id for part in ast.walk(tree) if isinstance(part, ast.Name)} | set(NAMES)
+    methods = [part.body for part in tree.body if isinstance(part, ast.ClassDef) and part.name == "Agent"]
+    remarks = []
+    for method in (part for body in methods for part in body if isinstance(part, ast.FunctionDef)):
+        if method.name.startswith("on_") and method.name not in used:
+            hint = did_you_mean(method.name, NAMES, SIMILAR) or "; docs/callbacks.md lists the callbacks"
+            remarks.append((method.lineno, f"{method.name} is never called by Hippodrome{hint}"))
+    line = _last(tree.body, MATCH)
+    if config.project.has_sessions and config.project.matching != MATCH and line and MATCH not in used:
         sentence = f"{MATCH}() is never called; matching: {MATCH} under project of config.yml asks for it"
-        methods_found += [
-            (unused_function.lineno, sentence)
-            for unused_function in _unused_functions(tree.body, used)
-            if unused_function.name == MATCH
-        ]
-    return [Diagnostic(label, line, "", sentence, remark=True) for line, sentence in methods_found if sentence]
-
-
-def _unused_functions(body: list[ast.stmt], used: set[str]) -> list[ast.FunctionDef]:
-    """The functions of `body` whose names the file does not use."""
-    return [part for part in body if isinstance(part, ast.FunctionDef) and part.name not in used]
-
-
-def _nearly_called(name: str, members: set[str]) -> str:
-    """The remark on a method that looks as if it were called; otherwise empty."""
-    if name in (*NAMES, *_METHODS) or name.startswith("__"):
-        return ""
-    callback = name.startswith("on_")
-    names = NAMES if callback else tuple(set(_METHODS) - members)
-    hint = did_you_mean(name, names, SIMILAR if callback else _SIMILAR_METHODS)
-    if callback:
-        hint = hint or "; docs/callbacks.md lists the callbacks"
-    return f"{name} is never called by Hippodrome{hint}" if hint else ""
+        remarks.append((line, sentence))
+    return [Diagnostic(label, line, "", sentence, remark=True) for line, sentence in remarks]
 
 
 def line_of(path: Path, method: str) -> int | None:

@@ -15,10 +15,12 @@ from typing import Annotated
 import typer
 
 from hippodrome.console.arguments import StudyFolder
-from hippodrome.control.config import Config, ConfigErrors, Diagnostic, agent_imports, read_project
+from hippodrome.control.config import Config, ConfigErrors, Diagnostic, agent_imports, read_project, remarks
 from hippodrome.local import requirements
 from hippodrome.local.check import agent, agent_file, model_cost
-from hippodrome.local.check.project import check_project
+from hippodrome.local.check.designs import check_designs
+from hippodrome.local.check.pages import check_pages
+from hippodrome.local.check.sessions import check_sessions
 from hippodrome.local.study_folder import must_hold_study
 
 
@@ -62,6 +64,24 @@ def command(
     raise typer.Exit(1 if _mistakes(found) or (strict and found) else 0)
 
 
+def check_project(folder: Path, config: Config | None) -> list[Diagnostic]:
+    """Return the problems of pages and agent.py, and remarks on the configuration. agent.py is not run.
+
+    `config` is None if the configuration cannot be read.
+    """
+    plays = config is None or bool(config.game_steps)
+    found: list[Diagnostic] = []
+    if config:
+        found += remarks.remarks_on(folder, config)
+        if plays and config.project.may_run_on_aws:
+            found += agent_imports.requirement_remarks(folder)
+        found += [*check_sessions(folder, config), *check_designs(folder, config)]
+        if plays:
+            found += agent_file.never_called(folder, config)
+            found += [*agent_imports.hiding_files(folder), *agent_imports.hidden_files(folder)]
+    return found + check_pages(folder, config) + (agent_file.read_agent(folder) if plays else [])
+
+
 def _say(line: str) -> None:
     sys.stdout.write(f"  {line}\n")
     sys.stdout.flush()
@@ -78,12 +98,8 @@ def _mistakes(diagnostics: Iterable[Diagnostic]) -> list[Diagnostic]:
 
 def _summary(diagnostics: list[Diagnostic], config: Config | None) -> str:
     mistakes = len(_mistakes(diagnostics))
-    remarks = len(diagnostics) - mistakes
-    counts = [_count(number, word) for number, word in ((mistakes, "mistake"), (remarks, "remark")) if number]
+    numbers = ((mistakes, "mistake"), (len(diagnostics) - mistakes, "remark"))
+    counts = [f"{number} {word}{'' if number == 1 else 's'}" for number, word in numbers if number]
     if config is None or mistakes:
         return f"{' and '.join(counts)}."
     return f"No mistakes{f', {counts[0]}' if counts else ''}: {config.summary()}"
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}{'' if number == 1 else 's'}"

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from hippodrome.bots import forms
 from hippodrome.control.config import Config, Diagnostic
 from hippodrome.control.config.folder import ConfigSource, read_source
 from hippodrome.control.model import rules
+from hippodrome.control.participants.markup import MARK
+from hippodrome.local.check.earlier_answers import controls_of, source_of
 from hippodrome.protocol.similar import did_you_mean
 
 OF_EVERY_STEP = frozenset({"outcome", "passed", "tries"})
@@ -85,15 +86,12 @@ def _rules(config: Config) -> Iterator[tuple[tuple[str | int, ...], str]]:
 
 def _choices(file: Path, field: str) -> list[str]:
     """The values among which participants choose for a field; none if they may type, or if Jinja fills them in."""
-    text = file.read_text(encoding="utf-8", errors="replace")
-    controls = [
-        control for form in forms.read(f"<form>{text}</form>") for control in form.controls if control.name == field
-    ]
+    controls = [control for control in controls_of(source_of(file)) if control.name == field]
     if any(control.kind not in ("radio", "select") for control in controls):
         return []
     values = [control.value or "on" for control in controls if control.kind == "radio"]
     values += [option.value for control in controls for option in control.options if option.value]
-    return [] if any("{" in value for value in values) else list(dict.fromkeys(values))
+    return [] if any(MARK in value for value in values) else list(dict.fromkeys(values))
 
 
 def _of_checks(config: Config) -> Iterator[tuple[tuple[str | int, ...], str, str, str]]:
@@ -112,11 +110,5 @@ def _of_rules(config: Config) -> Iterator[tuple[tuple[str | int, ...], str, str,
 
 def _fields(files: tuple[Path, ...]) -> set[str]:
     """The names of all fields in these files. Parts that Jinja fills in may bring others, so then there are none."""
-    names: set[str] = set()
-    for file in files:
-        text = file.read_text(encoding="utf-8", errors="replace")
-        for form in forms.read(f"<form>{text}</form>"):
-            names |= {control.name for control in form.controls if control.name}
-        if "{{" in text and any("{" in name for name in names):
-            return set()
-    return names
+    names = {control.name for file in files for control in controls_of(source_of(file)) if control.name}
+    return set() if any(MARK in name for name in names) else names

@@ -83,7 +83,7 @@ class EarlierAnswers:
         if step.type.on_server:
             return [*_PLAYED, *_PLAYED_TOGETHER]
         texts = [source_of(file) for file in step.files]
-        names = [control.name for text in texts for form in _forms(text) for control in form.controls if control.name]
+        names = [control.name for text in texts for control in controls_of(text) if control.name]
         may_have_more = any("<script" in text.lower() for text in texts) or any(MARK in name for name in names)
         return None if may_have_more else list(dict.fromkeys(names))
 
@@ -107,7 +107,7 @@ class EarlierAnswers:
             return None
         found: set[str] = set()
         for text in texts:
-            controls = [control for form in _forms(text) for control in form.controls if control.name == field]
+            controls = [control for control in controls_of(text) if control.name == field]
             if not controls:
                 continue
             answers = _choices(controls)
@@ -191,7 +191,13 @@ _PLAYED_TOGETHER = ("scores", "session", "player")  # what an answer holds in ga
 
 def every_branch(text: str) -> fragments.Content:
     """Return a page with all branches of its template, and with marks in the place of each Jinja expression."""
-    return fragments.prepare(PageSource(text).text).fill({})
+    unclosed = re.compile(r"\{[{%#]")  # with which Jinja would fail
+    return fragments.prepare(unclosed.sub(MARK * 2, PageSource(text).text)).fill({})
+
+
+def controls_of(text: str) -> list[forms.Control]:
+    """Return the fields and buttons of a page, in all branches of its template."""
+    return [control for form in _forms(text) for control in form.controls]
 
 
 def _forms(text: str) -> list[forms.Form]:

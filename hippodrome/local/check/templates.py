@@ -13,7 +13,6 @@ from hippodrome.bots import forms
 from hippodrome.control.config import Config, Diagnostic
 from hippodrome.control.participants import fragments, sandbox
 from hippodrome.control.participants.sandbox import FragmentError
-from hippodrome.local.check.answers_named import check_answers_named
 from hippodrome.local.check.earlier_answers import EarlierAnswers, Variant
 from hippodrome.local.check.wording import short
 from hippodrome.protocol.answer import UNMATCHED
@@ -73,8 +72,44 @@ def check_template(label: str, source: str, config: Config | None, visitors: Vis
             message = f"nothing is shown: there is no value {short(name.name)}{did_you_mean(name.name, VALUES)}"
             yield Diagnostic(label, name.lineno, "", message, remark=True)
     yield from _group_of_nobody(label, parsed, config)
-    yield from check_answers_named(label, parsed, visitors.earlier)
+    yield from _answers_named(label, parsed, visitors.earlier)
     yield from _shown(label, page, parsed, config, visitors)
+
+
+def _answers_named(label: str, parsed: nodes.Template, earlier: EarlierAnswers) -> Iterator[Diagnostic]:
+    """Yield remarks on steps that the study does not have, and on fields that an earlier step does not have."""
+    called = {id(call.node) for call in parsed.find_all(nodes.Call)}  # `answers["2"].items()` is a method
+    lookups: list[nodes.Getitem | nodes.Getattr] = [*parsed.find_all(nodes.Getitem), *parsed.find_all(nodes.Getattr)]
+    for node in lookups:
+        if id(node) in called:
+            continue
+        inner, key = node.node, _key(node)
+        if _is_answers(inner) and isinstance(key, int) and not isinstance(key, bool):
+            yield _nothing_shown(label, node, f'write answers["{key}"], with quotes')
+        if _is_answers(inner) and isinstance(key, str) and (why := earlier.why_no_step(key)):
+            yield _nothing_shown(label, node, why)
+        if not isinstance(inner, nodes.Getitem | nodes.Getattr) or not _is_answers(inner.node):
+            continue
+        if not isinstance(key, str):
+            continue
+        step = _key(inner)
+        fields = earlier.fields_of(step) if isinstance(step, str) else None
+        if fields is not None and key not in fields:
+            has = ", ".join(fields) or "no fields"
+            message = f"step {step} has no answer {short(key)}{did_you_mean(key, fields)} (it has {short(has)})"
+            yield _nothing_shown(label, node, message)
+
+
+def _nothing_shown(label: str, node: nodes.Node, why: str) -> Diagnostic:
+    return Diagnostic(label, node.lineno, "", f"nothing is shown: {why}", remark=True)
+
+
+def _is_answers(node: nodes.Node) -> bool:
+    return isinstance(node, nodes.Name) and node.name == "answers"
+
+
+def _key(node: nodes.Getitem | nodes.Getattr) -> object:
+    return node.attr if isinstance(node, nodes.Getattr) else getattr(node.arg, "value", None)
 
 
 def _group_of_nobody(label: str, parsed: nodes.Template, config: Config | None) -> Iterator[Diagnostic]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hippodrome.control.config import ConfigErrors, read_project
-from hippodrome.local.check.project import check_project
+from hippodrome.local.check.command import check_project
 from testing.designed import write
 
 CONFIG = """project:

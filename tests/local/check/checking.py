@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hippodrome.control.config import read_project
 from hippodrome.local.check import agent as agent_check
-from hippodrome.local.check.project import check_project
+from hippodrome.local.check.command import check_project
 from testing import processes
 from tests.local.conftest import ROOT
 

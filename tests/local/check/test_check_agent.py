@@ -585,18 +585,6 @@ def test_an_agent_with_a_syntax_error_is_refused(folder: Path, source: bytes) ->
     assert "Python cannot read this" in line
 
 
-@pytest.mark.parametrize(
-    ("method", "near"),
-    [("feedbak(self, word)", "feedback"), ("rest(self, seed=None)", "reset"), ("rest(self)", None)],
-)
-def test_a_method_that_is_nearly_an_optional_one_is_remarked(folder: Path, method: str, near: str | None) -> None:
-    if near == "reset":
-        agent(folder, "def reset(self", "def begin(self")
-    agent(folder, "class Agent:", f"class Agent:\n    def {method}: pass\n")
-    found = [line for line in looked(folder) if "never called" in line]
-    assert [line.rpartition("did you mean ")[2] for line in found] == ([f"{near}?"] if near else found)
-
-
 @pytest.mark.parametrize("control", ["good", "trainOnline", "wave"])
 def test_words_that_reach_no_method_of_the_agent_are_remarked(folder: Path, control: str) -> None:
     config(folder, "left: true", f"left: true, {control}: true")

@@ -439,6 +439,7 @@ def test_several_pages_without_a_step_are_one_remark(folder: Path) -> None:
 @pytest.mark.parametrize("text", ["<" * 5000, "<!", "<![x", "{{", "<img src='http://[x'>", "\0<p\0>", "<p " * 999])
 def test_no_page_makes_the_check_crash(folder: Path, text: str) -> None:
     page(folder, text)
+    page(folder, "{{ answers['1'].word }}", "bye")
     looked(folder)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from hippodrome.control.config import read_project
 from hippodrome.local.check import agent as agent_check
-from hippodrome.local.check.project import check_project
+from hippodrome.local.check.command import check_project
 from hippodrome.trial.agent.match import SECONDS
 from tests.local.check.test_players import AGENT
 from tests.local.conftest import write_study
