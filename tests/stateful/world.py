@@ -12,7 +12,6 @@ from typing import Any
 
 import msgspec
 
-from hippodrome.control.limits.slots import Slots
 from hippodrome.control.model import ids, messages, server
 from hippodrome.control.model.messages import KeepWarm, StopServer, to_message
 from hippodrome.control.model.project import MASTER_LIST, MasterList, Project, step_key
@@ -37,6 +36,7 @@ from hippodrome.protocol.keys import answer_key, handover_key, handovers_folder,
 from testing import aws_events
 from testing.port_faults import Crash, FaultAt
 from testing.servers import Servers
+from testing.slots import release_participant
 from testing.studies import PAGES
 from testing.tasks import Task
 from tests.stateful.account import Account
@@ -491,7 +491,7 @@ class World:
         for name in [name for name in account.zone.records if theirs(name)]:
             del account.zone.records[name]
         account.fleet.own_clusters = {name for name in account.fleet.own_clusters if not theirs(name)}
-        Slots(account).release_participant(self.project.id, user)
+        release_participant(account.documents, self.project.id, user)
         told = [handover_key(self.project.id, name) for name in had]
         told += [server.key(name.partition("-")[0]) for name in had]
         for key in [*account.kept]:

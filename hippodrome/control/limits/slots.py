@@ -86,41 +86,6 @@ class Slots:
             more = limits.shard_share(free, shard)
             self._shared.change(key, ParticipantSlots, partial(ParticipantSlots.with_room_for, more=more))
 
-    def documents_naming(self, project_id: str, user_id: str) -> list[str]:
-        """Return the keys of the documents that hold this participant's slot.
-
-        Documents that cannot be read are not among them; `unreadable` returns their keys. AWS calls: one listing, and a
-        read of each document.
-        """
-        label, readable = ids.server_label(project_id, user_id), self._participant_slots(project_id)
-        return [key for key, people in readable.items() if people and label in people.labels]
-
-    def unreadable(self, project_id: str) -> list[str]:
-        """Return the keys of the documents of participants' slots that cannot be read.
-
-        AWS calls: one listing, and a read of each document.
-        """
-        return [key for key, people in self._participant_slots(project_id).items() if people is None]
-
-    def _participant_slots(self, project_id: str) -> dict[str, ParticipantSlots | None]:
-        """By key, the record in every document of participants' slots; None if it cannot be read."""
-        shards = {limits.participant_slots_key(project_id, shard) for shard in range(SHARDS)}
-        participant_slots: dict[str, ParticipantSlots | None] = {}
-        for entry in self._platform.documents.list(limits.participant_slots_folder(project_id)):
-            if entry.key in shards:
-                try:
-                    participant_slots[entry.key] = self._shared.read(entry.key, ParticipantSlots)
-                except ValueError as error:
-                    failure("participants' slots cannot be read", error, project=project_id)
-                    participant_slots[entry.key] = None
-        return participant_slots
-
-    def release_participant(self, project_id: str, user_id: str) -> None:
-        """Release the slot of a participant whose data are erased."""
-        label = ids.server_label(project_id, user_id)
-        for key in self.documents_naming(project_id, user_id):
-            self._shared.change(key, ParticipantSlots, partial(ParticipantSlots.without, label=label))
-
     # Servers
 
     def acquire(self, project: Project, record: Server) -> bool:
