@@ -11,8 +11,8 @@ from typing import Annotated
 
 import typer
 
-from hippodrome.trial.gym.connection import Limits
 from hippodrome.trial.gym.server import serve, unusable
+from hippodrome.trial.gym.settings import Limits
 
 _DEFAULT = Limits()
 _HIGHEST = 10**9

@@ -24,8 +24,8 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from hippodrome.trial.gym import linux
-from hippodrome.trial.gym.connection import PATH, Limits, Settings
 from hippodrome.trial.gym.forms import described
+from hippodrome.trial.gym.settings import PATH, Limits, Settings
 
 REFUSING = 16
 """The connections beyond the limit that get a process, which refuses them with a sentence."""

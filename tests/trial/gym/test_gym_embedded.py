@@ -15,14 +15,14 @@ from websockets.exceptions import ConnectionClosed
 
 from hippodrome.cli import main
 from hippodrome.trial.gym import override
-from hippodrome.trial.gym.connection import Limits
+from hippodrome.trial.gym.settings import Limits
 from testing.gym_server import ROOT, GymServerProcess, TextClient, gym_server
 
 PROGRAM = '''
 import gymnasium
 from hippodrome.trial import gym as gymie
 from hippodrome.trial.gym import EnvironmentNotFound, override
-from hippodrome.trial.gym.connection import Limits
+from hippodrome.trial.gym.settings import Limits
 
 
 @override("get_env")
