@@ -7,6 +7,7 @@ hold ids and answers. One that is missing or damaged is made again from the sour
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import os
 import secrets
@@ -203,7 +204,7 @@ class Records:
             return self.load(user or STRAYS) or Record(user, "", user or STRAYS)
         number = self.number_of(user)
         # Names that differ only by case are one file on some systems.
-        for folder in (number, *(f"{number}~{count}" for count in range(2, len(self.names) + 3))):
+        for folder in itertools.chain([number], (f"{number}~{count}" for count in itertools.count(2))):
             if folder in self.names:
                 record = self.load(folder) or Record(user, number, folder)
                 if record.user == user:

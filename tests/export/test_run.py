@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import signal
+import threading
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from hippodrome.console.problem import Exit
 from hippodrome.control.model import warm_pool
 from hippodrome.control.model.project import MASTER_LIST, MasterList
 from hippodrome.control.model.records import to_json
-from hippodrome.export import fetch, manifest
+from hippodrome.export import fetch, manifest, recording
 from hippodrome.export import run as export_run
 from hippodrome.export.fetch import Fetcher, interruption
 from hippodrome.export.page_fields import fields_of
@@ -428,6 +429,20 @@ def test_a_participant_whose_record_is_damaged_or_gone_is_fetched_again(place: P
         kept.write_bytes(damage)
     assert place.done()["run"]["new"] == 6
     assert place.listed() == before
+
+
+def test_recordings_are_converted_one_at_a_time_by_one_thread(place: Place, monkeypatch: Any) -> None:
+    """Memory does not grow with the number of recordings: ten threads would each keep what a long one takes."""
+    convert, threads = recording.convert, set()
+
+    def noted(*args: Any, **named: Any) -> Any:
+        threads.add(threading.get_ident())
+        return convert(*args, **named)
+
+    monkeypatch.setattr(recording, "convert", noted)
+    crowd(place.put, place.tmp, 12)
+    assert place.done()["counts"]["recordings"] == 11
+    assert len(threads) == 1
 
 
 # Cut off
