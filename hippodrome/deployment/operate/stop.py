@@ -14,7 +14,7 @@ from hippodrome.console import screen
 from hippodrome.console.formatting import count
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.aws import AwsPlatform
-from hippodrome.control.model.messages import StopServer
+from hippodrome.control.model.messages import STOP_REASON_PREFIX, StopServer
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.server import Reason, Server
 from hippodrome.control.ports import RunningTask
@@ -25,7 +25,6 @@ from hippodrome.deployment.aws.account import find_installation, open_account
 from hippodrome.deployment.aws.resource_names import STACK
 from hippodrome.deployment.core import explain, options, participants
 from hippodrome.deployment.core.captured_log import functions_log
-from hippodrome.deployment.core.leftover_steps import cluster_steps, removal_steps
 from hippodrome.deployment.core.server_records import Records
 from hippodrome.deployment.core.stages import Executor, PlanStep, step
 from hippodrome.deployment.core.study_selection import one_or_all
@@ -114,9 +113,16 @@ class Stopper:
 
     def plan(self, servers: FoundServers, advance: Callable[[int], None] = lambda _: None) -> list[PlanStep]:
         """Plan the steps that stop and remove what was found; empty if only tasks that are stopping are left."""
+        from hippodrome.control.servers.dns import delete_dns_records  # noqa: PLC0415 - imports Powertools, which other commands do without
+
+        platform, left = self._platform, servers.leftovers
+        reason = f"{STOP_REASON_PREFIX} {Reason.STOPPED}"
         steps = [step(self._stop_servers, servers.servers, advance)] if servers.servers else []
-        steps += removal_steps(self._platform, servers.leftovers)
-        return steps + cluster_steps(self._platform, servers.leftovers)
+        steps += [step(platform.tasks.stop, task.task, task.cluster, reason) for task in left.tasks]
+        steps += [step(delete_dns_records, platform, left.dns_records)] if left.dns_records else []
+        steps += [step(platform.timers.cancel, timer) for timer in left.timers]
+        # Last, since ECS refuses to delete a cluster while a task in it is ending.
+        return steps + [step(platform.tasks.delete_cluster, cluster) for cluster in left.clusters]
 
     def _stop_servers(self, servers: Sequence[Server], advance: Callable[[int], None]) -> None:
         """Stop the servers in chunks. `Termination` reads each record again and decides by what it finds then."""
