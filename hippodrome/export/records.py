@@ -166,9 +166,10 @@ class Records:
     """The records in an export folder. With `apart`, participants have random numbers instead of their ids, which
     `identities.csv` keeps. Threads may read and write different records at once."""
 
-    def __init__(self, folder: Path, *, apart: bool) -> None:
+    def __init__(self, folder: Path, *, apart: bool, dry: bool = False) -> None:
         self._folder = folder
         self._place = folder / PRIVATE / "records"
+        self._dry = dry  # whether nothing may be written
         self._numbers = self._read_numbers() if apart else None
         self.names = {path.stem for path in self._place.glob("*.json")}
         self._taken = {name.casefold() for name in self.names}
@@ -191,8 +192,8 @@ class Records:
         return self._numbers[user]
 
     def _append(self, line: str) -> None:
-        if not self._place.exists():
-            return  # a dry run makes nothing
+        if self._dry:
+            return
         path = self._folder / IDENTITIES
         with path.open("a", encoding="utf-8", newline="") as file:
             file.write(line if file.tell() else f"participant,userId\r\n{line}")

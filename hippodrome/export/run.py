@@ -74,7 +74,7 @@ def look(source: Source, project_id: str, folder: Path, options: Options) -> Tal
     """Return what a run would do. Changes nothing. Raises `Problem`."""
     _refuse(source, project_id, folder, _find_project(source, project_id), options)
     options = options.with_those_in(folder)
-    records = Records(folder, apart=options.apart)
+    records = Records(folder, apart=options.apart, dry=True)
     wanted = options.wanted._replace(dry=True)
     fetcher = Fetcher(project_id, source, records=records, folder=folder, wanted=wanted)
     tally = fetcher.run(lambda listed, done: None)

@@ -349,6 +349,17 @@ def test_a_dry_run_says_what_there_is_to_do_and_makes_nothing(place: Place) -> N
     assert everything(place.out / "private") == before
 
 
+def test_a_dry_run_gives_no_participant_a_number(place: Place) -> None:
+    crowd(place.put, place.tmp, 2)
+    assert place.run("--dry-run", "--identities", "apart").code == Exit.CHANGES
+    assert not place.out.exists()
+    place.done("--identities", "apart")
+    before = everything(place.out)
+    arrive(place.put, "user-new", {"1": {"consent": "yes"}})
+    assert place.run("--dry-run", "--json", "--identities", "apart").json["new"] == 2
+    assert everything(place.out) == before
+
+
 def everything(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
