@@ -104,7 +104,7 @@ def command(
     anyway: options.Anyway = False,
     as_json: Annotated[bool, typer.Option("--json", help="With --plan: the answer as JSON, for scripts.")] = False,
 ) -> int:
-    """Put everything on AWS: the installation, its certificate, and the study in FOLDER. What is there already stays.
+    """Put everything on AWS: the installation, its certificate, and the study. What is there already stays.
 
     Run it again after an update of Hippodrome, or to change a setting; options that are left out stay as they are. It
     asks only before something would be lost.
