@@ -4,7 +4,7 @@ The researcher's text stays unchanged, byte for byte, except for a few tags. Bef
 addresses, of pictures for example, become addresses of the project's files (a link to one opens a tab), and scripts get
 the nonce without which no browser runs them: so a tag in a value gets neither. All else depends on which branches of a
 template are shown, and happens afterwards: tags of a whole document (`<html>`, `<body>`, `<form>` …) are dropped, what
-is left open is closed, and the page's own button and heading are noted.
+is left open and would swallow the frame's button is closed, and the page's own button and heading are noted.
 """
 
 from __future__ import annotations
@@ -173,6 +173,7 @@ class _Filled:
         self._title = self._lang = ""
         self._drawings = 0  # open <svg> elements, whose <title> is their own
         self._unseen = ""  # the open element whose content browsers do not show
+        self._in_select = False
 
     def read(self, page: str) -> Content:
         for token in markup.tokens(page):
@@ -183,6 +184,8 @@ class _Filled:
                 self._end(token)
             elif token.is_comment:
                 self._out.append(token.source if token.is_closed else token.source + "-->")
+        if self._in_select:  # in an open one, browsers leave out the frame's button
+            self._out.append("</select>")
         return Content(
             html="".join(self._out),
             has_fields="field" in self._seen,
@@ -200,6 +203,7 @@ class _Filled:
             return
         self._note(name, markup.attributes(token.attributes))
         self._drawings += name == "svg" and not token.attributes.endswith("/")
+        self._in_select |= name == "select"
         if name in _UNSEEN and not self._unseen:
             self._unseen = name
         if name == "title" and self._drawings <= 0:
@@ -211,6 +215,7 @@ class _Filled:
 
     def _end(self, token: markup.Token) -> None:
         self._drawings -= token.end == "svg"
+        self._in_select &= token.end != "select"
         if token.end == self._unseen:
             self._unseen = ""
         if token.end not in _DROPPED:

@@ -75,6 +75,19 @@ def test_no_tag_or_comment_is_left_open_to_swallow_the_frame(text: str) -> None:
     assert {"id": "ours"} in after.named("button")
 
 
+@pytest.mark.parametrize(
+    ("source", "end"),
+    [
+        ("<select name=a><option>1", "</select>"),
+        ("<select><option>1</select>", ""),
+        ("{% if 1 %}<SELECT><option>1</option>{% endif %}<p>x</p>", "</select>"),
+    ],
+)
+def test_a_select_that_is_left_open_is_closed(source: str, end: str) -> None:
+    shown = source.replace("{% if 1 %}", "").replace("{% endif %}", "")
+    assert prepare(source, BASE).render({}) == shown + end
+
+
 @given(st.text(alphabet=st.characters(exclude_characters="<{\0", exclude_categories=["Cs"])))
 def test_text_without_tags_is_unchanged(text: str) -> None:
     assert prepare(text, BASE).render({}) == text
