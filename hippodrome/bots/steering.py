@@ -205,7 +205,7 @@ def _judged(step: Step, answers: Mapping[str, Any]) -> dict[str, Any]:
 def offered(form: Form, name: str, constants: Sequence[Any]) -> list[str]:
     """Return the values that a participant may give to the field `name`; "" stands for no answer.
 
-    Of a number or a text, they are those in `named` and close to them, within the limits of the field.
+    Of a number or a text, they are those in `constants` and close to them, within the limits of the field.
     """
     values: list[str] = []
     for control in form.controls:

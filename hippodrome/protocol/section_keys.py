@@ -175,8 +175,9 @@ def check_section(
 ) -> tuple[_Declared, list[SectionProblem]]:
     """Return the values of a section, and all its problems. `path` is the path of the section. Never raises.
 
-    `given` holds JSON values, or texts and `values.Plain`. Of a wrong value the valid part stays, if it is a section or
-    a map, else the default takes its place. Problems with keys that are not declared have the sentence `UNKNOWN_KEY`.
+    `written` holds JSON values, or texts and `values.Plain`. Of a wrong value the valid part stays, if it is a section
+    or a map, else the default takes its place. Problems with keys that are not declared have the sentence
+    `UNKNOWN_KEY`.
     """
     values: dict[str, Any] = {}
     valid: set[str] = set()

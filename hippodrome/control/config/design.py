@@ -536,7 +536,7 @@ def _texts(value: Any, path: KeyPath) -> Iterator[tuple[KeyPath, str]]:
 def with_sections(design: Design, base: TrialSection) -> list[Step]:
     """Return the steps, with the sections that each game has at the levels that it names.
 
-    `base` is the checked section `trial` at the first levels. Mistakes are added to `found`.
+    `base` is the checked section `trial` at the first levels. Mistakes are added to `design.mistakes`.
     """
     steps, count = [], 0
     plain = base.document()

@@ -283,7 +283,7 @@ class Lobby:
         return _no_server_yet(after.formed_of(me.label) or formed, servers)
 
     def _change(self, project: Project, decisions: Decisions, settle: Callable[[Decisions], Decisions]) -> Decisions:
-        """Change the document; return `known` if others change it all the time. The next request then decides."""
+        """Change the document; return `decisions` if others change it all the time. The next request then decides."""
         try:
             return self._store.change(project, settle)
         except RetryLater:
@@ -328,10 +328,11 @@ def _candidate(me: _Asker) -> questions.Candidate:
 
 
 def _due(label: str, decisions: Decisions, before: Decisions, after: Decisions) -> Decisions:
-    """The decisions that this participant's request carries out. It has read `known` and changed `before` to `after`.
+    """The decisions that this participant's request carries out.
 
-    They are the decision on its own participant, and the sessions of others to which it has given a server. If another
-    request has decided on this participant since `known` was read, that request carries the decision out.
+    The request has read `decisions`, and changed `before` to `after`. It carries out the decision on its own
+    participant, and the sessions of others to which it has given a server. If another request has decided on this
+    participant since `decisions` was read, that request carries the decision out.
     """
     own = after.decided_for(label) if decisions.is_decided(label) or not before.is_decided(label) else Decisions()
     waited = {session.labels for session in before.without_server()}

@@ -89,7 +89,7 @@ def number_here(document: Decisions, entries: Entries, project: Project, label: 
 
 
 def _without_fallen(document: Decisions, entries: Entries, decisions: Decisions, now: datetime) -> Decisions:
-    """The document without the proposals in `seen` that have fallen apart."""
+    """The document without the proposals in `decisions` that have fallen apart."""
     before = {proposal.id for proposal in decisions.proposed}
     fallen = [
         proposal.id for proposal in document.proposed if proposal.id in before and _has_fallen(proposal, entries, now)

@@ -290,7 +290,7 @@ def requestable_attempt(record: Server) -> int | None:
 
 
 def attempt_after_pause(record: Server, arrived: datetime | None) -> int | None:
-    """Return the attempt to start for a participant who `came` to a game after their server had ended; None if none.
+    """Return the attempt to start if the participant `arrived` at this game after their server had ended; else None.
 
     The server had waited for nobody, or its time was over: the study has two sittings, or the participant was slow.
     """
@@ -310,9 +310,9 @@ def may_go_without(record: Server) -> bool:
     return record.reason in FAILED or (none_left and any(past.reason in FAILED for past in record.earlier))
 
 
-def replacing(before: Server, server: Server) -> Server:
-    """Return the record `wanted` of the next attempt, with the closed attempt `before` added to its `earlier`."""
-    return msgspec.structs.replace(server, earlier=(*before.earlier, past_attempt(before)))
+def replacing(before: Server, new: Server) -> Server:
+    """Return the record `new` of the next attempt, with the closed attempt `before` added to its `earlier`."""
+    return msgspec.structs.replace(new, earlier=(*before.earlier, past_attempt(before)))
 
 
 def found_no_slot(server: Server, attempt: int) -> bool:
@@ -320,9 +320,9 @@ def found_no_slot(server: Server, attempt: int) -> bool:
     return server.is_closed and server.attempt == attempt and server.reason is Reason.FULL
 
 
-def repeating(before: Server, server: Server) -> Server:
-    """Return the record `wanted` with the earlier attempts of `before`, an attempt without a slot that it repeats."""
-    return msgspec.structs.replace(server, earlier=before.earlier)
+def repeating(before: Server, new: Server) -> Server:
+    """Return the record `new` with the earlier attempts of `before`, an attempt without a slot that it repeats."""
+    return msgspec.structs.replace(new, earlier=before.earlier)
 
 
 def stopped_before_start(project_id: str, user_id: str, attempt: int, now: datetime) -> Server:

@@ -43,8 +43,8 @@ class Caa:
 def find(name: str, exists: Callable[[str], bool] = lambda name: True) -> Caa:
     """Ask DNS for the records that apply to a name: its own, or the records of the nearest domain above (section 3).
 
-    `known` says whether a name exists. DNS is not asked for a name that does not
-    (`hippodrome.deployment.aws.hosted_zone.exists` says why). Raises only what `known` raises.
+    `exists` says whether a name exists. DNS is not asked for a name that does not
+    (`hippodrome.deployment.aws.hosted_zone.exists` says why). Raises only what `exists` raises.
     """
     import dns.exception
     import dns.resolver

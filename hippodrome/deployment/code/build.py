@@ -112,7 +112,7 @@ def _function(name: str, tree: _Tree, wheels: WheelCache, python: str) -> Functi
 
 
 def _pruned(wheel: Wheel, packages: Iterable[str], ends: tuple[str, ...]) -> dict[str, ZipMember]:
-    """Return the wheel's Python files that the imports `wanted` reach without the modules `ends` and their imports."""
+    """Return the wheel's Python files that imports of `packages` reach without the modules `ends` and their imports."""
     paths = {_module(path): path for path in wheel.members if path.endswith(".py")}
 
     def source(module: str) -> SourceModule | None:

@@ -63,7 +63,7 @@ def unreadable(entry: UnreadableEntry) -> str:
 
 
 def choose(projects: Iterable[Project], project_id: str | None) -> list[Project]:
-    """Return the project with the id `wanted`; None: all. Raises `Problem` if no project has this id."""
+    """Return the project with this id; None: all. Raises `Problem` if no project has this id."""
     projects = list(projects)
     if project_id is None:
         return projects

@@ -147,7 +147,7 @@ def _refuse_outer(folder: Path, project: str) -> None:
 
 
 def _bucket(account: Account, stack: str, bucket_name: str | None, project: str) -> Source:
-    """Open the installation's bucket, or the bucket `kept` that `destroy` has kept."""
+    """Open the installation's bucket, or the bucket of this name, which `destroy` has kept."""
     from hippodrome.deployment.aws.account import find_installation
     from hippodrome.deployment.stack.retained_bucket import open_bucket
     from hippodrome.export.bucket import Bucket

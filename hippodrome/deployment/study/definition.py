@@ -121,7 +121,7 @@ def _secrets(found: Mapping[str, Any]) -> list[str]:
 
 
 def _contains(found: Any, pattern: Any) -> bool:
-    """Whether `found` has all values of `wanted`. ECS adds values that were left out, such as host ports."""
+    """Whether `found` has all values of `pattern`. ECS adds values that were left out, such as host ports."""
     if isinstance(pattern, Mapping):
         return isinstance(found, Mapping) and all(_contains(found.get(key), value) for key, value in pattern.items())
     if isinstance(pattern, Sequence) and not isinstance(pattern, str):

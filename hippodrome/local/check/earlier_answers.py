@@ -151,11 +151,11 @@ class EarlierAnswers:
         return source_of(self._folder / step.files[(group or 0) % len(step.files)].name)
 
     def variants(
-        self, group: int | None, constants: Collection[str | float], container: Container[object]
+        self, group: int | None, constants: Collection[str | float], names: Container[object]
     ) -> Iterator[Variant]:
         """Yield sets of answers that differ in one answer, with the words for it.
 
-        `named` are the names that a page uses, and `constants` what it may compare answers with. So this answer is one
+        `names` are the names that a page uses, and `constants` what it may compare answers with. So this answer is one
         of the choices of a question, or a constant, or a number beside it.
         """
         most, least = self.answers(group)
@@ -175,7 +175,7 @@ class EarlierAnswers:
             else:
                 continue
             for name, possible in values.items():
-                for value in dict.fromkeys(possible) if name in container else ():
+                for value in dict.fromkeys(possible) if name in names else ():
                     words = f"{name} = {json.dumps(value, ensure_ascii=False)} at step {step.key}"
                     yield Variant({**most, step.key: {**most[step.key], name: value}}, f"{step.key}.{name}", words)
 

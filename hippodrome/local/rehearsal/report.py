@@ -39,7 +39,7 @@ def report(
 
     `play`: after how many seconds a bot stops its game; 0: never. `recorded`: whether the study keeps recordings.
     `live`: whether participants get in. `warnings` come from the functions' log; `crashes` are the errors of agent.py.
-    `found` is None if the folder of the data is not known, and `left` is None if nobody looked for servers that are
+    `verification` is None if the folder of the data is not known, and `leftovers` if nobody looked for servers that are
     left over.
     """
     table = Table(show_header=False, title=_title(reports, seconds), title_justify="left")

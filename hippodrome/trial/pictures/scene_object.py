@@ -135,8 +135,8 @@ def checked_object(fields: Mapping[str, Any], name: str, problems: list[str]) ->
 def checked_again(earlier: CheckedObject, mapping: Mapping[str, Any], value: Mapping[str, Any]) -> CheckedObject | None:
     """Return a checked object with new values of some fields, and check only these.
 
-    `earlier` is the checked object, made of `given`; `value` is what `render()` returned now. Returns None if the whole
-    object must be checked again.
+    `earlier` is the checked object, made of `mapping`; `value` is what `render()` returned now. Returns None if the
+    whole object must be checked again.
     """
     if list(mapping) != list(value) or list(map(type, mapping.values())) != list(map(type, value.values())):
         return None

@@ -28,7 +28,7 @@ AssignmentDocument = Handover | SessionDocument
 
 
 def with_handover(settings: TrialSettings, handover: Handover) -> TrialSettings:
-    """Return the settings of a warm server with what its handover `found` says: who plays there, or which session."""
+    """Return the settings of a warm server with what its handover says: who plays there, or which session."""
     if is_session_id(handover.user_id):
         return replace(
             settings, warm_server=False, session=handover.user_id, group=handover.group, server=handover.server
@@ -46,7 +46,7 @@ def with_members(settings: TrialSettings, session_document: SessionDocument) -> 
 
 
 def set_environment(environment: MutableMapping[str, str], assignment_document: AssignmentDocument | None) -> None:
-    """Set the environment variables that tell the researcher's code who plays; remove them if that is not `found` yet.
+    """Set the environment variables that tell the researcher's code who plays; remove them if that is not known yet.
 
     For a session they hold its id and group; no variable holds a participant's id.
     """

@@ -129,7 +129,7 @@ class TrialServer:
         return self._failure if reason == "error" else 0
 
     def end(self, reason: str) -> None:
-        """End the server. `reason` is for the log; `error` makes the exit status a failure. For the event loop."""
+        """End the server. `reason` is for the log; "error" makes the exit status a failure. For the event loop."""
         self._lifetime.end(reason)
 
     @property
@@ -197,7 +197,7 @@ class TrialServer:
         await Matching(self._store, lambda: self.settings, function).run()
 
     async def _assign(self, settings: TrialSettings, assignment_document: AssignmentDocument) -> None:
-        """Use the new settings, which follow from the document `found` that says who plays here."""
+        """Use the new settings, which follow from the document that says who plays here."""
         if self.settings.warm_server:
             self._in_background(self._store_files(await self._leftovers(settings)))
             log.info("this server is assigned to a %s now", "session" if settings.session else "participant")
