@@ -168,7 +168,7 @@ class Journey:
         without one may only answer the step that is due. If it names no step and repeats answers of the last minute, it
         is the same form sent again (`Answers.repeats`), and answers none.
         """
-        shown = visit.step_of_ticket(form.step, form.ticket, form.shown or "")
+        shown = visit.project.step_of_ticket(visit.user_id, form.step, form.ticket, form.shown or "")
         if shown is not None:
             return shown
         progress, own = self._repository.path_of(visit.project, visit.user_id)

@@ -139,7 +139,7 @@ class Relays:
         if expected and record and record.is_of_session:
             expected = member_token(expected, visit.user_id)
         has_token = bool(expected) and ids.secrets_equal(str(token), expected)
-        if not has_token and not visit.step_of_ticket(form.step, form.ticket):
+        if not has_token and not visit.project.step_of_ticket(visit.user_id, form.step, form.ticket):
             raise Refusal(403, NO_PROOF)
         return owner, record
 

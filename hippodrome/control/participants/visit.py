@@ -7,7 +7,6 @@ from datetime import datetime
 from functools import cached_property
 
 from hippodrome.control.http import Request
-from hippodrome.control.model.design import Step
 from hippodrome.control.model.project import Project
 from hippodrome.control.model.texts import Texts
 
@@ -33,7 +32,3 @@ class Visit:
     def on(self, project: Project) -> Visit:
         """Return the visit with another form of its study, such as the participant's own path."""
         return self if project is self.project else replace(self, project=project)
-
-    def step_of_ticket(self, key: str | None, ticket: str | None, shown: str = "") -> Step | None:
-        """Return the step with this key, if the ticket proves that this participant was shown it; else None."""
-        return self.project.step_of_ticket(self.user_id, key, ticket, shown)

@@ -168,7 +168,7 @@ class GameStep:
 
     def leave(self, visit: Visit, form: PostedForm) -> None:
         """Handle the form that the lobby's page sends when it is closed."""
-        if visit.step_of_ticket(form.step, form.ticket):
+        if visit.project.step_of_ticket(visit.user_id, form.step, form.ticket):
             self._shared.leave(visit)
 
     # Its polls
@@ -188,7 +188,7 @@ class GameStep:
     def _poll_together(self, visit: Visit, step: Step | None) -> dict[str, Any]:
         """The state of the lobby, or of the session's server. Without a membership, the query must have a ticket."""
         request, project = visit.request, visit.project
-        shown = visit.step_of_ticket(step.key if step else None, request.query_value("ticket"))
+        shown = visit.project.step_of_ticket(visit.user_id, step.key if step else None, request.query_value("ticket"))
         if shown is not None and shown.type.on_server:
             unassigned, assignment = request.has_query(UNASSIGNED), None
             if project.assigns and not unassigned:  # a page of an earlier registration may not know that it is
