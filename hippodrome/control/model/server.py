@@ -26,7 +26,7 @@ from hippodrome.protocol.session import is_session_id
 
 RECORDS = "_servers/"  # the folder of all servers' records
 SPOT_ATTEMPTS = 2  # the attempts up to this one run on Spot, later ones on demand
-AUTOMATIC_ATTEMPTS = SPOT_ATTEMPTS + 1  # up to this attempt, which is on demand, a lost server is replaced by itself
+AUTOMATIC_ATTEMPTS = SPOT_ATTEMPTS + 1  # up to this attempt, which is on demand, no participant has to ask
 MAX_ATTEMPTS = 8  # up to this attempt, a participant may request another server
 
 R = TypeVar("R")

@@ -162,11 +162,18 @@ class Journey:
         return self._get(visit) if request.wants_json else http.see_other(request.url())
 
     def _step_of(self, form: forms.PostedForm, visit: Visit) -> Step | None:
-        """The step that this form may answer; None if that step is not due.
+        """The step that this form answers; None if it answers none: it changes nothing, and the due page follows.
 
-        A valid ticket proves that the participant was shown the step, so their folder need not be listed. A form
-        without one may only answer the step that is due. If it names no step and repeats answers of the last minute, it
-        is the same form sent again (`Answers.repeats`), and answers none.
+        A valid ticket proves that the participant was shown the step, so their folder need not be listed. If the step
+        has an answer already, that stays (`Answers.store`). Without a valid ticket a form answers the step that is due,
+        unless
+
+        * the participant has not arrived yet, or has reached an end,
+        * it names another step, such as an earlier one,
+        * the step is a check or has `minSeconds`,
+        * it names no step, and repeats answers of the last minute: it is the same form sent again (`Answers.repeats`).
+
+        A form that cannot be read does not come here: its page says `notSaved` (`_post`).
         """
         shown = visit.project.step_of_ticket(visit.user_id, form.step, form.ticket, form.shown or "")
         if shown is not None:

@@ -5,9 +5,9 @@
 3. `start.py` handles that message, and calls `Replacement.write_record`: the next attempt's record replaces the closed
    one. The trial on the new server resumes from the recordings (`hippodrome/trial/recordings/resume.py`).
 
-After `AUTOMATIC_ATTEMPTS` the participant may request further attempts (`requestable_attempt`). These rules are in
-`model/server.py`. If the message of step 2 is lost, the sweep sends it again (`overdue.py`), and so does the
-participant's next GET (`participants/steps/game.py`).
+After `AUTOMATIC_ATTEMPTS` attempts (two on Spot, one on demand) the participant may request further ones, up to
+`MAX_ATTEMPTS` (`requestable_attempt`). These rules are in `model/server.py`. If the message of step 2 is lost, the
+sweep sends it again (`overdue.py`), and so does the participant's next GET (`participants/steps/game.py`).
 """
 
 from __future__ import annotations
