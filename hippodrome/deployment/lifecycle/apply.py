@@ -14,6 +14,7 @@ from rich.text import Text
 from hippodrome.console import screen
 from hippodrome.console.formatting import count, duration
 from hippodrome.console.problem import Problem
+from hippodrome.control.aws import errors
 from hippodrome.deployment.aws.account import Account, find_installation, site_host
 from hippodrome.deployment.core.finding import Finding, look
 from hippodrome.deployment.core.stages import Executor
@@ -116,7 +117,7 @@ def apply(account: Account, name: str, settings: StackSettings, request: ApplyRe
         return _unchanged(account, name)
     preflight.stop([*request.wrong, *preflight.look_at(prepared, request.study)], anyway=request.anyway)
     executor = Executor()
-    if prepared.existing is None and preflight.make_ecs_role(account):
+    if prepared.existing is None and _make_ecs_role(account):
         screen.info(f"ECS's role was made just now: {ROLE_PAUSE} seconds, until AWS knows it everywhere.")
         executor.sleep(ROLE_PAUSE)
 
@@ -142,6 +143,22 @@ def _without_remains(prepared: Prepared) -> Prepared:
     screen.info("It is deleted and made anew.")
     StackDeletion(prepared.account, prepared.stack, Executor()).run("Deleting the failed stack")
     return replace(prepared, described=None)
+
+
+def _make_ecs_role(account: Account) -> bool:
+    """Make ECS's service-linked role if the account has none: without it, a template's first cluster fails.
+
+    (aws-cloudformation/cloudformation-coverage-roadmap, issue 818.) Return whether it was made now: AWS knows it
+    everywhere some seconds later (IAM's user guide, "Changes that I make are not always immediately visible").
+    """
+    try:
+        account.client("iam").create_service_linked_role(AWSServiceName="ecs.amazonaws.com")
+    except ClientError as error:
+        # InvalidInput: the role exists. If these credentials may not make it, it may exist all the same.
+        if errors.code(error) not in {"InvalidInput", "AccessDenied", "InvalidAction", "EntityAlreadyExists"}:
+            raise
+        return False
+    return True
 
 
 def _carry_out(prepared: Prepared, request: ApplyRequest, executor: Executor, began: float) -> ApplyOutcome:

@@ -50,7 +50,7 @@ def stop(findings: Iterable[Finding], *, anyway: bool = False) -> None:
     bads = sum(finding.mark is Mark.BAD for finding in findings)
     if bads and not anyway:
         raise Problem(
-            f"{count(bads, 'thing')} {'is' if bads == 1 else 'are'} in the way, marked ✗. Nothing was made or changed.",
+            f"{count(bads, 'thing')} {'is' if bads == 1 else 'are'} in the way, marked ✗. Nothing was deployed.",
             "Put that right, and run the same command again.",
         )
 
@@ -302,22 +302,3 @@ def _left_over(prepared: Prepared) -> Iterator[Finding]:
             f"An earlier installation {name} has left {count(len(log_groups), 'log group')}, such as {log_groups[0]}.",
             f"Finish its removal: `hippodrome destroy --stack {name}`. The data stay.",
         )
-
-
-# -- ECS's role -------------------------------------------------------------------------------------------------------
-
-
-def make_ecs_role(account: Account) -> bool:
-    """Make ECS's service-linked role if the account has none: without it, a template's first cluster fails.
-
-    (aws-cloudformation/cloudformation-coverage-roadmap, issue 818.) Return whether it was made now: AWS knows it
-    everywhere some seconds later (IAM's user guide, "Changes that I make are not always immediately visible").
-    """
-    try:
-        account.client("iam").create_service_linked_role(AWSServiceName="ecs.amazonaws.com")
-    except ClientError as error:
-        # InvalidInput: the role exists. If these credentials may not make it, it may exist all the same.
-        if errors.code(error) not in {"InvalidInput", "AccessDenied", "InvalidAction", "EntityAlreadyExists"}:
-            raise
-        return False
-    return True

@@ -68,7 +68,7 @@ def test_all_problems_are_reported_at_once_with_their_remedies(
     world.caa[f"study.{DOMAIN}"] = caa.Caa(DOMAIN, (("issue", "digicert.com"),))
     world.limits.executions = 10
     record(world, f"study.{DOMAIN}")
-    with pytest.raises(Problem, match=r"3 things are in the way, marked ✗\. Nothing was made or changed\.") as caught:
+    with pytest.raises(Problem, match=r"3 things are in the way, marked ✗\. Nothing was deployed\.") as caught:
         apply(world.account, "hippodrome", FIRST, ApplyRequest(game))
     assert caught.value.advice == "Put that right, and run the same command again."
     lines = capsys.readouterr().err.splitlines()
