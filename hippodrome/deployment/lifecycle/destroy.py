@@ -226,7 +226,10 @@ class Removal:
             _remove(self.account.client("ssm").delete_parameter, Name=name)
 
     def _bucket(self, name: str, kind: str) -> None:
-        """Delete a bucket of the account with all versions of all objects. `kind` (code or data) is for messages."""
+        """Delete a bucket of the account with all versions of all objects. `kind` (code or data) is for messages.
+
+        If something is written into it meanwhile, it stays until the next round.
+        """
         if not inventory.bucket_exists(self.account, name):
             return
         with screen.ProgressBars() as bar:
@@ -235,8 +238,9 @@ class Removal:
         try:
             self.account.client("s3").delete_bucket(Bucket=name, ExpectedBucketOwner=self.account.id)
         except ClientError as error:
-            if errors.code(error) == "BucketNotEmpty":
-                raise Problem(f"Programs still write into {name}.", "Run the same command again.") from None
+            if errors.code(error) == "BucketNotEmpty":  # a server's last recording, or a browser's late request
+                screen.info(f"Something was written into {name} meanwhile.")
+                return
             if errors.code(error) != "NoSuchBucket":
                 raise
         screen.success(f"The {kind} bucket {name} is deleted.")
@@ -292,7 +296,11 @@ def command(
         raise Problem(
             f"Something is left of {stack} in {account.region}.",
             "Run the same command again.",
-            [*([f"stack: {stack}"] if found.stack else []), *(f"{thing.kind}: {thing.name}" for thing in found.things)],
+            [
+                *([f"stack: {stack}"] if found.stack else []),
+                *(f"{thing.kind}: {thing.name}" for thing in found.things),
+                *(f"S3 bucket: {bucket}" for bucket in found.data if data),
+            ],
         )
     kept.show()
     screen.success(f"Nothing{' else' if kept or found.data else ''} is left of {stack} in {account.region}.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.aws.tasks import EcsTasks
 from hippodrome.control.model.messages import StartServer
 from hippodrome.deployment.aws.account import open_account
+from hippodrome.deployment.aws.object_version import Version
+from hippodrome.deployment.aws.versions import VersionedBucket
 from hippodrome.deployment.core.stages import Executor
 from hippodrome.deployment.lifecycle import destroy
 from hippodrome.deployment.lifecycle.destroy import Removal
@@ -215,6 +217,26 @@ def test_what_is_left_is_named_and_the_command_fails(
 def test_destroy_with_data_deletes_the_bucket(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(installed, "--yes", "--data", monkeypatch=monkeypatch) == Exit.DONE
     assert buckets(installed) == set()
+
+
+@pytest.mark.parametrize("late", [2, 3])
+def test_a_bucket_into_which_something_is_written_meanwhile_is_emptied_again(
+    installed: World, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], late: int
+) -> None:
+    """The last recording of a server may come after its bucket was emptied. After three rounds destroy gives up."""
+    s3, empty, writes = installed.account.client("s3"), VersionedBucket.empty, [DATA] * late
+
+    def empty_slowly(self: VersionedBucket, note: Callable[[Sequence[Version]], None]) -> None:
+        empty(self, note)
+        if self.name in writes:
+            writes.pop()
+            s3.put_object(Bucket=self.name, Key="study/recordings/late", Body=b"x")
+
+    monkeypatch.setattr(VersionedBucket, "empty", empty_slowly)
+    emptied = late < destroy.ROUNDS
+    assert run(installed, "--yes", "--data", monkeypatch=monkeypatch) == (Exit.DONE if emptied else Exit.FAILED)
+    assert buckets(installed) == (set() if emptied else {DATA})
+    assert (f"S3 bucket: {DATA}" in capsys.readouterr().err) is not emptied
 
 
 def test_the_data_can_be_deleted_by_a_later_run(installed: World, monkeypatch: pytest.MonkeyPatch) -> None:
