@@ -1,2 +1,2 @@
 """Bots are simulated participants. They try a study before people come: `try` sends them through a study on one
-machine, `deploy doctor --rehearse --play` on AWS."""
+machine, `hippodrome doctor --rehearse --play` on AWS."""

@@ -1,6 +1,6 @@
 """Writes CloudWatch metrics. The sweep reports how many servers run, the age of the oldest, and what it did.
 Functions that see servers fail report how many failed, by `causes.FailureCategory`. No dimension names a project:
-alarms watch dimensions that are known beforehand. `deploy status` names the project.
+alarms watch dimensions that are known beforehand. `hippodrome status` names the project.
 
 The metrics are lines of the log in CloudWatch's embedded metric format, which needs no call and no permission. Cold
 starts take no longer: Powertools loads its metrics with its Logger. `infra/template.yml` has the alarms and dashboard.

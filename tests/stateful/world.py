@@ -461,7 +461,7 @@ class World:
         self.functions.invoke("administrator", "stop all", lambda: installed.shared(Servers).stop(stops), done, fault)
 
     def may_erase(self, user: str) -> bool:
-        """Return whether `deploy erase` may begin.
+        """Return whether `hippodrome erase` may begin.
 
         No message of the participant is being handled, no function waits, and listings show all tasks.
         """
@@ -470,7 +470,7 @@ class World:
         return not busy and all(task.listed <= now for task in self.tasks)
 
     def erase(self, user: str) -> None:
-        """Erase the participant, as `deploy erase` does when it is not interrupted."""
+        """Erase the participant, as `hippodrome erase` does when it is not interrupted."""
         self.tell(f"{user} is erased")
         self.calm = False
         account, label = self.account, ids.server_label(self.project.id, user)

@@ -64,7 +64,7 @@ REPLACED = (Reason.LOST, Reason.NO_CAPACITY)  # the reasons after which the next
 
 
 class PastAttempt(Record, frozen=True):
-    """An earlier attempt, kept in the record of the present one; `deploy cost` counts it.
+    """An earlier attempt, kept in the record of the present one; `hippodrome cost` counts it.
 
     Its fields are fields of `Server`.
     """

@@ -105,13 +105,13 @@ _EXPLANATIONS = {
         FailureCategory.REFUSED,
         "The server is not allowed to listen on its port.",
         "Register the project again, which makes a task definition that allows it; if it stays, "
-        "`hippodrome deploy --port 5000`, and register once more.",
+        "`hippodrome deploy --port 5000` in the project's folder, which registers it, too.",
     ),
     Cause.NO_CERTIFICATE: _Explanation(
         FailureCategory.REFUSED,
         "The server got no certificate for its address from Let's Encrypt, in three tries.",
         "`hippodrome doctor --all` says how many orders are left; letsencrypt.status.io says whether it works. "
-        "With a domain (`hippodrome deploy --domain`) servers need no certificates of their own.",
+        "With a domain (`hippodrome deploy --no-study --domain …`) servers need no certificates of their own.",
     ),
     Cause.CRASHED: _Explanation(
         FailureCategory.PROGRAM,

@@ -1,4 +1,4 @@
-"""`deploy logs`: shows what functions and servers have logged, in the order of time."""
+"""`hippodrome logs`: shows what functions and servers have logged, in the order of time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`deploy status`: shows participants by step, what runs, and what it costs."""
+"""`hippodrome status`: shows participants by step, what runs, and what it costs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`deploy stop`: stops every server, now."""
+"""`hippodrome stop`: stops every server, now."""
 
 from __future__ import annotations
 

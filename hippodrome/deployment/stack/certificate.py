@@ -227,7 +227,7 @@ def check(account: Account, installation: Installation, directory: str, own: boo
     if not zone.holds(servers):
         raise Problem(
             f"The hosted zone {zone.id} is for {zone.domain}, and {servers} does not lie in it.",
-            "Give the zone of your domain: `hippodrome deploy --zone …`.",
+            "Give the zone of your domain: `hippodrome deploy --no-study --zone …`.",
         )
     if own:
         return

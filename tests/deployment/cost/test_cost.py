@@ -1,4 +1,4 @@
-"""`deploy cost`: before a study without an account, after it from the servers' own records."""
+"""`hippodrome cost`: before a study without an account, after it from the servers' own records."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`deploy erase`: it deletes every version of one participant's data, changes no others', and writes a receipt."""
+"""`hippodrome erase`: it deletes every version of one participant's data, changes no others', and writes a receipt."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`deploy erase --from`: erasing a participant of a study on this machine, who played alone or with others."""
+"""`hippodrome erase --from`: erasing a participant of a study on this machine, who played alone or with others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`deploy erase` of a participant who played with others: their data are deleted, and the others' stay whole."""
+"""`hippodrome erase` of a participant who played with others: their data are deleted, and the others' stay whole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`deploy doctor`: checks whether a study can be held. Each check is a line, with advice if something is wrong."""
+"""`hippodrome doctor`: checks whether a study can be held. Each check is a line, with advice if something is wrong."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from hippodrome.deployment.operate import snapshot
 from hippodrome.deployment.operate.doctor.check_context import CheckContext
 from hippodrome.deployment.stack.stack import Stack
 
-DOMAIN = "With a domain there is no such limit: `hippodrome deploy --domain …`."
+DOMAIN = "With a domain there is no such limit: `hippodrome deploy --no-study --domain …`."
 PATIENCE = 10  # seconds to wait for the site
 
 
@@ -38,13 +38,12 @@ def zone(context: CheckContext) -> Iterator[Finding]:
     try:
         zone = read_zone(context.account, context.installation["HostedZoneId"])
     except Problem as problem:
-        yield bad(
-            "hosted zone", str(problem), "The servers' names are written there: run `hippodrome deploy` with --zone."
-        )
+        advice = "The servers' names are written there: run `hippodrome deploy --no-study` with --zone."
+        yield bad("hosted zone", str(problem), advice)
         return
     if not zone.holds(domain):
         text = f"{zone.id} is for {zone.domain}, not for {domain}."
-        yield bad("hosted zone", text, "Give `hippodrome deploy` its zone.")
+        yield bad("hosted zone", text, "Give `hippodrome deploy --no-study` its --zone.")
         return
     if context.delegation is None:
         yield good("hosted zone", f"{zone.domain} ({zone.id}); DNS was not asked.")

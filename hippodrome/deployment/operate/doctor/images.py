@@ -38,8 +38,8 @@ def _project(context: CheckContext, project: Project) -> Iterator[Finding]:
         yield look(
             check,
             f"maxRuntime is {project.max_runtime} minutes{waits}; the installation stops servers after {allowed}.",
-            f"Give `hippodrome deploy` --max-runtime {needed}, or register the project with a shorter maxRuntime"
-            f"{' or warmServers: 0' if warm else ''}.",
+            f"Give `hippodrome deploy --no-study` --max-runtime {needed}, or register the project with a shorter "
+            f"maxRuntime{' or warmServers: 0' if warm else ''}.",
         )
     if not project.task_definition:
         yield bad(check, "has no task definition: no server can start.", AGAIN)

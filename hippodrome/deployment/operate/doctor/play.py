@@ -328,7 +328,7 @@ class Play:
         return f"{count(len(records), 'server')} ended ({reasons}); nothing of them is left."
 
     def _data(self) -> str:
-        """`deploy data` fetches all answers and recordings of the bots."""
+        """`hippodrome data` fetches all answers and recordings of the bots."""
         self._progress("fetching the bots' data")
         context = self._context
         source = Bucket(context.account.client("s3"), context.installation["Bucket"], context.account.id)
@@ -463,7 +463,7 @@ class Play:
         if not confirmed:
             raise CheckFailed(
                 "An alarm was set off and reached its topic, which has no subscriber.",
-                "Give `hippodrome deploy` an --email, and follow the link in AWS's e-mail.",
+                "Give `hippodrome deploy --no-study` an --email, and follow the link in AWS's e-mail.",
                 Mark.LOOK,
             )
         whom = f"{len(confirmed)} {'address' if len(confirmed) == 1 else 'addresses'}"

@@ -110,4 +110,4 @@ def listeners(context: CheckContext) -> Iterator[Finding]:
     if confirmed:
         yield good("alarm e-mail", f"Alarms go to {', '.join(confirmed)}.")
     elif not pending:
-        yield look("alarm e-mail", "The alarms have no subscriber.", "Give `hippodrome deploy` an --email.")
+        yield look("alarm e-mail", "The alarms have no subscriber.", "Give `hippodrome deploy --no-study` an --email.")

@@ -23,7 +23,7 @@ LINES: Mapping[str, str] = {
     "game": "players get in by their token, see frames, press keys, and come to the end",
     "killed": "a server whose task is killed is replaced, and the game goes on",
     "end": "the stop step ends a server, and nothing of it is left",
-    "data": "`deploy data` finds every answer and every recording",
+    "data": "`hippodrome data` finds every answer and every recording",
     "timer": "a server that is not stopped is ended by its timer",
     "sweep": "the sweep removes what no server owns",
     "alarm": "an alarm reaches its topic, and its subscribers",
