@@ -271,6 +271,17 @@ def test_a_slider_that_was_touched_is_an_answer(world: World, tab: Any, touch: s
     assert sent_answers(world, tab) == {"r": value, "t": ""}
 
 
+def test_an_unset_slider_takes_no_other_answer_of_its_name_with_it(world: World, tab: Any) -> None:
+    world.source = (
+        "<input type=range name=r id=first><input type=range name=r>"
+        "<input type=range name=t disabled><input name=t value=50><input type=range value=7><input type=range name=none>"
+    )
+    tab.goto(world.url)
+    tab.focus("#first")
+    tab.keyboard.press("End")
+    assert sent_answers(world, tab) == {"r": "100", "t": "50"}
+
+
 def test_a_required_slider_must_be_moved(world: World, tab: Any) -> None:
     world.source = UNSET.format("required")
     tab.goto(world.url)

@@ -23,7 +23,7 @@ _JINJA_START = re.compile(rf"\{{[{{%#]|{MARK}")
 _JINJA_END = {"{{": "}}", "{%": "%}", "{#": "#}"}
 _TOKEN = re.compile(
     r"""
-      <!--(?:>|->|(?P<comment>.*?)(?:--!?>|\Z))
+      <!--(?:>|->|(?P<comment>.*?)(?:--!?>|(?P<open>\Z)))
     | <[!?](?P<declaration>[^>]*+)>?
     | </(?P<end>[a-zA-Z][^\s/>]*+)[^>]*+>?
     | <(?P<start>[a-zA-Z][^\s/>]*+)(?P<attributes>(?:=\s*+(?:"[^"]*+"|'[^']*+')|[^>])*+)>?
@@ -56,11 +56,8 @@ class Token(NamedTuple):
     end_tag: str = ""
     """For an element in `RAW`: its end tag as it is written; empty if it never ends."""
     is_comment: bool = False
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether the token ends before the page does."""
-        return self.source.endswith(("-->", "--!>") if self.is_comment else ">")
+    is_closed: bool = True
+    """Whether the token ends before the page does."""
 
 
 def tokens(page: str) -> Iterator[Token]:
@@ -75,7 +72,8 @@ def tokens(page: str) -> Iterator[Token]:
             at += len(content) + len(end_tag)
         attributes = found["attributes"] or ""
         is_comment = found[0].startswith("<!--")
-        yield Token(before, found[0], found.start(), start, end, attributes, content, end_tag, is_comment)
+        is_closed = found["open"] is None if is_comment else found[0].endswith(">")
+        yield Token(before, found[0], found.start(), start, end, attributes, content, end_tag, is_comment, is_closed)
     yield Token(page[at:], "", len(page))
 
 

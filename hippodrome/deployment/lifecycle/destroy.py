@@ -154,10 +154,13 @@ class Removal:
             screen.success(f"The stack {self.name} is deleted.")
 
     def _stop_servers(self, installation: Installation | None) -> None:
-        """Stop servers by their records, if the bucket exists; then stop all other tasks in the cluster."""
+        """Stop servers by their records, if the bucket exists; then stop all tasks that are left in the clusters.
+
+        Raises `Problem` if a task is left: once the stack is gone, nothing would stop it.
+        """
         if installation is None or not inventory.cluster_exists(self.account, installation["Cluster"]):
             return
-        ecs, cluster = self.account.client("ecs"), installation["Cluster"]
+        ecs, clusters = self.account.client("ecs"), {installation["Cluster"]}
         if inventory.bucket_exists(self.account, installation["Bucket"]):
             stopper = Stopper(self.account.platform(installation), executor=self.executor)
             with screen.ProgressBars() as bar:
@@ -167,17 +170,22 @@ class Removal:
                 screen.success(f"{count(len(stopper.stopped), 'server')} stopped.")
             for error in stopper.errors if remaining.to_do else ():
                 screen.warning(error)
+            clusters |= {
+                server.name for server in remaining.servers
+            }  # a participant's own cluster has the server's name
+            clusters |= {task.cluster for task in remaining.leftovers.tasks}
         tasks = EcsTasks(lambda: ecs, lambda: self.account.client("ec2"), installation.__getitem__)
 
         def running() -> Sequence[str]:
-            arns = tasks.arns(cluster)
-            for arn in arns:
+            left = [(cluster, arn) for cluster in sorted(clusters) for arn in tasks.arns(cluster)]
+            for cluster, arn in left:
                 _remove(ecs.stop_task, cluster=cluster, task=arn, reason="the installation is being removed")
-            return arns
+            return [cluster for cluster, _ in left]
 
         if left_running := self.executor.wait(running, STOPPING):
             raise Problem(
-                f"{count(len(left_running), 'task')} still in the cluster {cluster}.", "Run it again in a minute."
+                f"{count(len(left_running), 'task')} still in {', '.join(dict.fromkeys(left_running))}.",
+                "Run it again in a minute.",
             )
 
     def _validation_records(self) -> None:

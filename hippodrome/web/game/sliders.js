@@ -48,7 +48,14 @@ export function addSlider(slider) {
   });
 }
 
-// A slider that a script of the page has moved is sent.
+// A slider that a script of the page has moved is sent. Fields that share its name are, too.
 export function removeUnset(formData) {
-  for (const [slider, value] of unset) if (slider.value === value) formData.delete(slider.name);
+  for (const [slider, value] of unset) {
+    if (slider.value !== value || slider.matches(":disabled")) continue;
+    const values = formData.getAll(slider.name);
+    const at = values.lastIndexOf(value);
+    if (at >= 0) values.splice(at, 1);
+    formData.delete(slider.name);
+    for (const other of values) formData.append(slider.name, other);
+  }
 }

@@ -75,6 +75,16 @@ def test_no_tag_or_comment_is_left_open_to_swallow_the_frame(text: str) -> None:
     assert {"id": "ours"} in after.named("button")
 
 
+@pytest.mark.parametrize("end", ["", "-", "!>", ">x", "-!>", "--!", "x>"])
+def test_a_comment_that_is_left_open_is_closed(end: str) -> None:
+    source = f"<p>a<!-- {end}"
+    assert prepare(source, BASE).render({}) == source + "-->"
+
+
+def test_a_comment_without_a_space_is_no_closed_one() -> None:
+    assert prepare("<!--!>", BASE).render({}) == "<!--!>-->"
+
+
 @pytest.mark.parametrize(
     ("source", "end"),
     [

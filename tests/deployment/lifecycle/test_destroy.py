@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from botocore.exceptions import ClientError
 
 from hippodrome import cli
 from hippodrome.console.problem import Exit, Problem
@@ -462,3 +463,30 @@ def test_warm_servers_are_stopped_also_those_that_start_meanwhile(
         removal.run(removal.look(), data=False)
         assert tries[:2] == [0, 0]
         assert ([*installation.platform.tasks.list()], installation.records(), installation.timers()) == ([], {}, {})
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_a_server_in_its_own_cluster_that_its_record_could_not_stop_is_stopped_before_the_stack_goes(
+    refused: bool, monkeypatch: pytest.MonkeyPatch, access_keys: None
+) -> None:
+    own = study(task_definition="hippodrome", cluster="participant")
+    with Installed() as installation:
+        installation.register(own)
+        Servers(installation.platform).start(StartServer(own.id, "alice"))
+        [task] = installation.platform.tasks.list()
+        removal = Removal(open_account(), "hippodrome", Executor(lambda _: None))
+        deleted: list[list[Any]] = []
+
+        def stop(*_: Any) -> None:
+            raise ClientError({"Error": {"Code": "ServerException", "Message": "no"}}, "StopTask")
+
+        monkeypatch.setattr(EcsTasks, "stop", stop)
+        monkeypatch.setattr(Stack, "delete", lambda *_: deleted.append([*installation.platform.tasks.list()]))
+        if refused:
+            monkeypatch.setattr("hippodrome.deployment.lifecycle.destroy._remove", lambda *_, **__: None)
+            with pytest.raises(Problem, match=task.cluster):
+                removal.run(removal.look(), data=False)
+        else:
+            removal.run(removal.look(), data=False)
+        assert task.cluster != installation.platform.settings.cluster
+        assert deleted[:1] == ([] if refused else [[]])
