@@ -36,6 +36,8 @@ CONVERTED_AT_ONCE = 1
 MAX_PIECE = 256 * 1024 * 1024  # bytes; a piece holds what was said, and a model's answers, of two seconds
 MAX_DOCUMENT = 4 * 1024 * 1024  # bytes; next_step accepts answers of 256 KB
 _PLAYED = (KeyKind.RECORDING, KeyKind.TAPE)
+_OWN = ("recordings", f"{PRIVATE}/raw", f"{PRIVATE}/records", f"{PRIVATE}/minari.part")
+"""The folders that have only what runs have written."""
 
 
 class Wanted(NamedTuple):
@@ -160,6 +162,20 @@ class Fetcher:
                     self._remove(file)
                 self._records.remove(name)
         return count
+
+    def remove_unnamed(self) -> None:
+        """Remove what no record names: files that an interrupted run has left, or an earlier version. They may be those
+        of somebody who has been erased since."""
+        named: set[str] = set()
+        for record in self._records:
+            named.add(f"{PRIVATE}/records/{record.folder}.json")
+            named.update(exported.path for file in record.files.values() for exported in file.exported)
+        for path in own_files(self._folder):
+            if path.relative_to(self._folder).as_posix() not in named:
+                path.unlink()
+        for name in _OWN:
+            for top, *_ in os.walk(self._folder / name, topdown=False):
+                remove_empty(Path(top), self._folder)
 
     # -- in the workers
 
@@ -362,6 +378,15 @@ def interruption() -> Iterator[Callable[[], None]]:
     finally:
         signal.signal(signal.SIGINT, before)
     check()
+
+
+def own_files(folder: Path) -> Iterator[Path]:
+    """Yield the files in the folders that have only what runs have written, and the database in which an earlier
+    version kept answers."""
+    for name in _OWN:
+        for top, _, names in os.walk(folder / name):
+            yield from (Path(top, name) for name in names)
+    yield from (folder / PRIVATE).glob("state.sqlite*")
 
 
 def remove_empty(empty: Path, top: Path) -> None:

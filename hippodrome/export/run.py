@@ -22,7 +22,7 @@ from hippodrome.console.problem import Problem
 from hippodrome.control.model.project import MASTER_LIST, MasterList, Project, read_list
 from hippodrome.export import keys, manifest
 from hippodrome.export.answers import Answers, LongAnswers, Runs, Tries
-from hippodrome.export.fetch import Fetcher, Tally, Wanted
+from hippodrome.export.fetch import Fetcher, Tally, Wanted, own_files
 from hippodrome.export.keys import KeyKind
 from hippodrome.export.manifest import ExportedFile
 from hippodrome.export.page_fields import read_fields
@@ -132,7 +132,7 @@ class _Export:
         return {"folder": str(self.folder), **self._write_manifest(self._datasets()), "run": asdict(tally)}
 
     def _fetch(self) -> Tally:
-        known = bool(self._records.names)
+        known = any(own_files(self.folder))
         wanted = self.options.wanted
         fetcher = Fetcher(self.project_id, self.source, records=self._records, folder=self.folder, wanted=wanted)
         with _bar("Fetching") as progress:
@@ -144,6 +144,7 @@ class _Export:
                 "If that is right, delete the folder. If not, look at STUDY, --stack and --region.",
             )
         tally.gone += fetcher.forget_gone()
+        fetcher.remove_unnamed()
         return tally
 
     def _tables(self) -> list[Table]:
@@ -212,9 +213,7 @@ class _Export:
         target, wanted = self.folder / "minari", "minari" in self.options.formats
         if not wanted and not target.exists():
             return []
-        last: dict[str, Any] = {"files": [], "minari": []}
-        with contextlib.suppress(Problem):
-            last = manifest.read(self.folder) or last
+        last = _read_manifest(self.folder) or {"files": [], "minari": []}
         files = [file for file in last["files"] if file.path.startswith("minari/")]
         same = {file for file in last["files"] if file.path.startswith("recordings/")} == {*self._converted()}
         if files and same and not any(manifest.difference(self.folder, file) for file in files):
@@ -281,7 +280,7 @@ def _refuse(source: Source, project_id: str, folder: Path, project: Project | No
     """Raise `Problem` for a folder that holds something else, or for a source without participants of this project."""
     if folder.exists() and not folder.is_dir():
         raise Problem(f"{folder} is a file.", "Name a folder, or none.")
-    ours = (folder / manifest.NAME).exists() or (folder / PRIVATE).is_dir()
+    ours = (folder / PRIVATE / "lock").exists() or bool(_read_manifest(folder))
     if folder.is_dir() and not ours and any(folder.iterdir()):
         raise Problem(f"{folder} has other files already.", "Name an empty folder, or one that does not exist yet.")
     _refuse_other(source, project_id, folder, options)
@@ -315,6 +314,13 @@ def _read_about(folder: Path) -> dict[str, str]:
     return about
 
 
+def _read_manifest(folder: Path) -> dict[str, Any]:
+    """The folder's manifest; {} if there is none, or if it is damaged or not one of Hippodrome."""
+    with contextlib.suppress(Problem):
+        return manifest.read(folder) or {}
+    return {}
+
+
 def _refuse_other(source: Source, project_id: str, folder: Path, options: Options) -> None:
     """Raise `Problem` if an earlier run of this folder had another study, source or mode of identities, or if nobody
     knows any more whose its numbers are."""
@@ -324,7 +330,7 @@ def _refuse_other(source: Source, project_id: str, folder: Path, options: Option
         "source": "was filled from the {}",
         "place": "was filled from the {}",
     }
-    before = _read_about(folder)
+    before = _read_about(folder) or _read_manifest(folder)  # an earlier version wrote no about.json
     for name, value in _about(source, project_id, options).items():
         if (other := before.get(name, value)) != value:
             other = f"{other} of this machine" if other == "folder" else other

@@ -26,7 +26,7 @@ from hippodrome.export import fetch, manifest, recording
 from hippodrome.export import run as export_run
 from hippodrome.export.fetch import Fetcher, interruption
 from hippodrome.export.page_fields import fields_of
-from hippodrome.export.records import Records
+from hippodrome.export.records import Record, Records
 from hippodrome.export.source import FileGone, Folder
 from hippodrome.export.table_files import TableFile
 from hippodrome.export.tables import Episodes
@@ -524,6 +524,110 @@ def test_a_file_that_was_not_noted_before_a_kill_is_made_again(place: Place) -> 
     assert not left.exists()
 
 
+ERASED = "user-0001"
+
+
+def killed_while_a_record_is_written(place: Place) -> None:
+    replace = os.replace
+
+    def kill(part: Path, target: Path) -> None:
+        if target.name == f"{ERASED}.json":
+            raise KeyboardInterrupt
+        replace(part, target)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "replace", kill)
+        assert place.run("--raw").code == Exit.INTERRUPTED
+    assert (place.out / f"private/records/{ERASED}.part").exists()
+
+
+def killed_before_a_record_names_the_recording(place: Place) -> None:
+    save = Records.save
+
+    def kill(self: Records, of: Record) -> None:
+        if of.user == ERASED and of.recordings():
+            raise KeyboardInterrupt
+        save(self, of)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Records, "save", kill)
+        assert place.run("--raw").code == Exit.INTERRUPTED
+    assert any((place.out / "recordings" / ERASED).rglob("*.parquet"))
+
+
+def damaged_record(place: Place) -> None:
+    place.done("--raw")
+    (place.out / f"private/records/{ERASED}.json").write_text("{")
+
+
+def killed_while_datasets_are_made(place: Place) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Path, "rename", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert place.run("--format", "minari").code == Exit.INTERRUPTED
+    assert (place.out / "private/minari.part").exists()
+
+
+def folder_of_an_earlier_version(place: Place) -> None:
+    """It kept answers in a database, and had no records."""
+    place.done("--raw")
+    shutil.rmtree(place.out / "private/records")
+    (place.out / "private/about.json").unlink()
+    for name in ("state.sqlite", "state.sqlite-wal"):
+        (place.out / "private" / name).write_text(ERASED)
+
+
+LEFTOVERS = [
+    killed_while_a_record_is_written,
+    killed_before_a_record_names_the_recording,
+    damaged_record,
+    killed_while_datasets_are_made,
+    folder_of_an_earlier_version,
+]
+
+
+@pytest.mark.parametrize("leave", LEFTOVERS)
+def test_nothing_of_an_erased_participant_is_left_by_an_earlier_run(place: Place, leave: Any) -> None:
+    crowd(place.put, place.tmp, 3)
+    leave(place)
+    notes = [place.out / "notes" / "day.txt", place.out / "private" / "key.txt", place.out / "recordings.txt"]
+    for note in notes:
+        note.parent.mkdir(exist_ok=True)
+        note.write_text("the researcher's")
+    before = everything(place.out)
+    shutil.rmtree(place.data / key(ERASED, ""))
+    place.run("--dry-run")
+    place.run("--check")
+    assert everything(place.out) == before
+    assert place.run("--raw").code == Exit.DONE
+    assert not [path for path in place.out.rglob("*") if ERASED in str(path.relative_to(place.out))]
+    assert not [name for name, body in everything(place.out).items() if ERASED.encode() in body]
+    assert all(note.exists() for note in notes)
+    assert len(place.rows("episodes")) == 1
+    for note in notes:
+        note.unlink()
+    assert place.run("--check").code == Exit.DONE
+
+
+@pytest.mark.parametrize("leave", LEFTOVERS)
+def test_leftovers_are_kept_if_the_source_has_no_participants(place: Place, leave: Any) -> None:
+    crowd(place.put, place.tmp, 3)
+    leave(place)
+    (place.data / "maze" / "users").rename(place.tmp / "elsewhere")
+    before = set(everything(place.out))
+    assert place.run().code == Exit.FAILED
+    assert before <= set(everything(place.out))
+
+
+def test_a_run_without_recordings_keeps_those_that_are_here(place: Place) -> None:
+    crowd(place.put, place.tmp, 3)
+    place.done("--raw", "--format", "parquet")
+    (place.out / "answers.parquet").unlink()
+    here = {name for name in everything(place.out) if name.startswith(("recordings/", "private/raw/"))}
+    assert place.run("--format", "csv").code == Exit.DONE
+    assert here
+    assert here <= set(everything(place.out))
+
+
 @pytest.mark.parametrize("what", [(TableFile, "_write"), (Episodes, "rows"), (manifest, "write")])
 def test_tables_are_whole_after_an_interruption(place: Place, what: tuple[Any, str]) -> None:
     users = crowd(place.put, place.tmp, 3)
@@ -663,11 +767,19 @@ def test_foreign_folders_and_wrong_options_are_refused(place: Place, tmp_path: P
     assert place.run(out=full).code == Exit.FAILED
     assert [path.name for path in full.iterdir()] == ["thesis.txt"]
     assert place.run(out=full / "thesis.txt").code == Exit.FAILED
+    for own in ("manifest.json", "private/letter.txt", "recordings/song.txt"):
+        (full / own).parent.mkdir(exist_ok=True)
+        (full / own).write_text('{"name": "mine"}')
+    before = everything(full)
+    assert "has other files already" in place.run(out=full).err
+    assert everything(full) == before
     for wrong in (["--format", "xls"], ["--format", ","], ["--identities", "away"]):
         assert place.run(*wrong).code == Exit.FAILED
     assert place.run(study="another").code == Exit.FAILED
     assert place.run(study="no such/id").code == Exit.FAILED
     place.done()
+    assert "identities together" in place.run("--identities", "apart").err
+    (place.out / "private/about.json").unlink()  # as an earlier version leaves it
     assert "identities together" in place.run("--identities", "apart").err
     assert main(["data", "maze", "--to", str(place.out), "--from", str(tmp_path / "none")]) == Exit.FAILED
 
