@@ -135,7 +135,7 @@ class LlmSection(Section):
     price: dict[str, float] | None = keyed.key(
         _price,
         None,
-        "The price of a million tokens; `hippodrome check` says what the study can cost at most.",
+        "The price of a million tokens; `hippodrome check` and `hippodrome cost` say what it can come to.",
         {
             "type": ["object", "null"],
             "properties": {"input": {"type": "number", "minimum": 0}, "output": {"type": "number", "minimum": 0}},

@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from hippodrome.control.config import read_project
-from hippodrome.local.check import model_cost
+from hippodrome.control.config import model_cost, read_project
 from hippodrome.local.fake_model import FakeModel, behaviour_of, reply_to
 from hippodrome.local.stand_in import StandIn
 
@@ -87,7 +86,7 @@ def test_check_says_what_the_model_can_cost(tmp_path: Path) -> None:
     more = ", maxTokens: 20000, price: {input: 0.5, output: 1.5}"
     found = study(tmp_path, project="maxParticipants: 200", more=more)
     assert model_cost.sentence(found) == (
-        "The language model costs at most 0.03 for each participant, and 6.00 for 200 participants (maxParticipants): "
+        "The language model costs about 0.03 at most for each participant, and 6.00 for 200 participants (maxParticipants): "
         "llm.maxTokens in each game, at the higher of the two prices."
     )
 
@@ -97,7 +96,7 @@ def test_each_run_of_a_block_is_a_game(tmp_path: Path) -> None:
     more = ', system: "Be {persona}", maxTokens: 1000000, price: {input: 1, output: 2}'
     words = model_cost.sentence(study(tmp_path, steps=steps, more=more))
     assert words is not None
-    assert words.startswith("The language model costs at most 4.00 for each participant:")
+    assert words.startswith("The language model costs about 4.00 at most for each participant:")
 
 
 def test_without_a_price_nothing_is_said(tmp_path: Path) -> None:

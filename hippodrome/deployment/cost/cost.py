@@ -75,7 +75,8 @@ def command(
         )
     config = _read(Path(study or "."))
     where = region or os.environ.get("AWS_REGION") or config.project.aws_setup.region or REGION
-    return _before(_study(config, people, minutes, spot), _warm_before(config), where, as_json)
+    estimated = _study(config, people, minutes, spot)
+    return _before(estimated, _warm_before(config), _model(config, people), where, as_json)
 
 
 # Before
@@ -124,10 +125,20 @@ def _study(config: Config, people: int, minutes: float | None, spot: bool) -> St
     )
 
 
-def _before(study: StudyToEstimate, warm: Sequence[dict[str, Any]], region: str, as_json: bool) -> int:
+def _model(config: Config, people: int) -> list[str]:
+    """Return a note on what the language model can cost, if the study has one."""
+    from hippodrome.control.config import model_cost  # noqa: PLC0415 - as in `_read`
+
+    words = model_cost.note(config, people)
+    return [words] if words else []
+
+
+def _before(
+    study: StudyToEstimate, warm: Sequence[dict[str, Any]], model: Sequence[str], region: str, as_json: bool
+) -> int:
     lines, monthly = study_lines(study), month_lines()
     each = total(lines) * (1 / study.participants)
-    notes = [*assumptions(study), note(region, datetime.now(UTC).date())]
+    notes = [*assumptions(study), *model, note(region, datetime.now(UTC).date())]
     if as_json:
         screen.result_json(
             {

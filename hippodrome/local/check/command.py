@@ -15,9 +15,9 @@ from typing import Annotated
 import typer
 
 from hippodrome.console.arguments import StudyFolder
-from hippodrome.control.config import Config, ConfigErrors, Diagnostic, agent_imports, read_project, remarks
+from hippodrome.control.config import Config, ConfigErrors, Diagnostic, agent_imports, model_cost, read_project, remarks
 from hippodrome.local import requirements
-from hippodrome.local.check import agent, agent_file, model_cost
+from hippodrome.local.check import agent, agent_file
 from hippodrome.local.check.designs import check_designs
 from hippodrome.local.check.pages import check_pages
 from hippodrome.local.check.sessions import check_sessions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from hippodrome import cli
 from hippodrome.console.problem import Exit
 from hippodrome.control.config import read_project
 from hippodrome.control.model.server import PastAttempt, Reason, Server, ServerState
@@ -114,6 +116,35 @@ def test_the_estimate_says_that_every_opened_link_starts_a_server(tmp_path: Path
     ):
         (tmp_path / "config.yml").write_text(text % events)
         assert _study(read_project(tmp_path), 1, None, spot=True).at_link is expected
+
+
+@pytest.mark.parametrize(
+    ("price", "said"),
+    [
+        (
+            ", price: {input: 0.5, output: 1.5}",
+            "about 0.03 at most for each participant, and 15.00 for 500 participants:",
+        ),
+        ("", "is not known: config.yml has no llm.price."),
+    ],
+)
+def test_the_estimate_says_that_the_language_model_comes_on_top(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], price: str, said: str
+) -> None:
+    (tmp_path / "steps").mkdir()
+    for page in ("consent", "thanks"):
+        (tmp_path / "steps" / f"{page}.html").write_text("x")
+    text = "project: {id: maze, steps: {1: consent, 2: game, 3: thanks}}\ntrial: {game: maze%s}\n"
+    (tmp_path / "config.yml").write_text(text % "")
+    assert cli.main(["cost", str(tmp_path)]) == Exit.DONE
+    assert "language model" not in capsys.readouterr().out
+    (tmp_path / "config.yml").write_text(
+        text % f', llm: {{url: "https://x.example/v1", model: small, maxTokens: 20000{price}}}'
+    )
+    assert cli.main(["cost", str(tmp_path), "--participants", "500", "--json"]) == Exit.DONE
+    (line,) = [line for line in json.loads(capsys.readouterr().out)["assumptions"] if "language model" in line]
+    assert said in line
+    assert line.endswith("The other figures are without it.")
 
 
 def test_the_high_estimate_is_for_moving_textures_and_says_so() -> None:
