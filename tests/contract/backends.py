@@ -23,7 +23,9 @@ from testing.moto_world import MotoWorld
 concurrent = pytest.mark.parametrize("backend", ["aws", "local"], indirect=True)
 """For tests with many threads: the fake in memory is for one thread, and no test asks more of it."""
 
-_REQUEST = TaskRequest("", "hippodrome", "hippodrome", cpu=1, memory=2, environment={"TOKEN": "secret"})
+_REQUEST = TaskRequest(
+    "", "hippodrome", "hippodrome", cpu=1, memory=2, environment={"TOKEN": "secret", "PROJECT_ID": "maze"}
+)
 
 
 def name(attempt: int = 1, user: str = "P1") -> str:
@@ -122,6 +124,7 @@ def local_backend(folder: Path) -> Iterator[Backend]:
     state = folder / "state"
     command = (sys.executable, str(Path(__file__).parent / "stub_server.py"))
     platform = LocalPlatform(folder / "data", state, handlers={}, command=command, stop_timeout=5, say=lambda _: None)
+    platform.tasks.add_project("maze", folder)
     try:
         yield LocalBackend(platform)
     finally:

@@ -109,7 +109,6 @@ class LocalPlatform:
         self.tasks = ProcessTasks(
             state,
             data,
-            project_folder,
             self.bus.emit,
             command=command,
             stop_timeout=stop_timeout,
@@ -159,7 +158,7 @@ class LocalPlatform:
         self.documents.tidy()
         lost: list[Server] = []
         steps: list[Callable[[], object]] = [
-            self.tasks.clear,
+            self._clear,
             lambda: lost.extend(self._open_records()),
             self.bus.start,
             partial(start_thread, self._sweep, name="sweep"),
@@ -171,6 +170,11 @@ class LocalPlatform:
             self.bus.emit(event(record.name, record.task or "", record.cluster, exit_code=KILLED))
         self.bus.drain(START_RETRY_SECONDS)  # before a page is shown
         return len(lost)
+
+    def _clear(self) -> None:
+        """End what a killed process has left. Recordings are kept also if it served other studies. Raises OSError."""
+        registered = ProjectCache(self).projects()
+        self.tasks.clear(project.id for project in registered if project.trial.get("s3upload", True))
 
     def _open_records(self) -> list[Server]:
         """The records of servers that are not closed. Raises OSError."""

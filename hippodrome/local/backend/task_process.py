@@ -52,21 +52,20 @@ class Shared:
 
     state: Path
     data: Path
-    project: Path
     command: Sequence[str]
     stop_timeout: float
     emit: Emit
     say: Say
     retry: Retry
     projects: dict[str, Path] = field(default_factory=dict)
-    """The folders of projects by their ids. `project` is the folder of any other."""
+    """The folders of the projects that are served here, by their ids."""
     with_model: set[str] = field(default_factory=set)  # the ids of projects whose games have a language model
     unrecorded: set[str] = field(default_factory=set)  # the ids of projects that keep no recordings (`s3upload`)
     closed: threading.Event = field(default_factory=threading.Event)  # set when this process ends
 
     def agent_folder(self, project_id: str) -> Path:
         """Return the folder of this project's agent.py."""
-        return layout.agent_folder(self.projects.get(project_id, self.project)).resolve()
+        return layout.agent_folder(self.projects[project_id]).resolve()
 
     def log(self, name: str) -> Path:
         """Return the log file of the server of this name."""

@@ -12,10 +12,10 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from hippodrome.control.ports import Address, RunningTask, TaskRequest
+from hippodrome.control.ports import Address, Refused, RunningTask, TaskRequest
 from hippodrome.local.backend.processes import end_everything
 from hippodrome.local.backend.retry import Retry
 from hippodrome.local.backend.task_process import HOST, Emit, Say, Shared, TaskProcess
@@ -37,7 +37,6 @@ class ProcessTasks:
         self,
         state: Path,
         data: Path,
-        project_folder: Path,
         emit: Emit,
         *,
         command: Sequence[str] = PYTHON_TRIAL,
@@ -54,7 +53,6 @@ class ProcessTasks:
         self._shared = Shared(
             state=state.resolve(),
             data=data.resolve(),
-            project=project_folder.resolve(),
             command=tuple(command),
             stop_timeout=stop_timeout,
             emit=emit,
@@ -71,6 +69,9 @@ class ProcessTasks:
     # The port
 
     def run(self, request: TaskRequest) -> str:
+        if request.environment.get(environment.PROJECT_ID) not in self._shared.projects:
+            # Another study has played with these data: its game must not be played with this one's agent.
+            raise Refused("its study is not served here: `hippodrome run` in the study's own folder serves it")
         earlier, token = self._servers.get(request.name), request.environment.get(environment.TOKEN)
         if earlier and earlier.token != token:  # the record of that earlier server was deleted with the data
             self.forget([request.name])
@@ -124,10 +125,13 @@ class ProcessTasks:
         (self._shared.with_model.add if has_model else self._shared.with_model.discard)(project_id)
         (self._shared.unrecorded.discard if keeps_recordings else self._shared.unrecorded.add)(project_id)
 
-    def clear(self) -> None:
-        """End the servers that a killed `run` has left, and move their recordings to the data. Raises OSError."""
+    def clear(self, others: Iterable[str] = ()) -> None:
+        """End the servers that a killed `run` has left, and move their recordings to the data. Raises OSError.
+
+        `others` are the ids of projects that are not served here and keep their recordings.
+        """
         end_everything(self._shared.state, LEFT_SECONDS)
-        for project_id in self._shared.projects:
+        for project_id in {*self._shared.projects, *others}:
             self._shared.rescue(project_id)
         for note in (self._shared.state / "tasks").iterdir():
             note.unlink()

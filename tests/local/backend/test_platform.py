@@ -14,6 +14,7 @@ from hippodrome.functions import installed
 from hippodrome.local.backend import platform as platform_module
 from hippodrome.local.backend.platform import LocalPlatform
 from testing.waiting import until
+from tests.local.conftest import write_study
 
 FAKE = (sys.executable, str(Path(__file__).parents[1] / "fake_trial.py"))
 NAME = "saaaaaaaaaaaaaaaaaaaa-1"
@@ -25,12 +26,13 @@ def test_messages_timers_and_events_reach_their_functions(tmp_path: Path, monkey
     came: dict[str, list[Any]] = {"start": [], "stop": [], "task": [], "sweep": []}
     handlers = {name: lambda event, context, events=events: events.append(event) for name, events in came.items()}
     platform = LocalPlatform(tmp_path / "data", tmp_path / "state", handlers=handlers, command=FAKE)
+    platform.tasks.add_project("study", tmp_path)
     platform.start()
     try:
         assert installed.platform() is platform
         platform.bus.publish(Topic.START, {})
         platform.timers.set(NAME, platform.now(), {})
-        platform.tasks.run(TaskRequest(NAME, "h", "h", 1, 2, {"TOKEN": "x"}))
+        platform.tasks.run(TaskRequest(NAME, "h", "h", 1, 2, {"TOKEN": "x", "PROJECT_ID": "study"}))
         until(lambda: all(came.values()))
     finally:
         platform.close(1)
@@ -40,6 +42,28 @@ def test_messages_timers_and_events_reach_their_functions(tmp_path: Path, monkey
         if thread.name.startswith(("queue", "timers", "task", "end")):
             thread.join(60)
             assert not thread.is_alive(), thread.name
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_recordings_of_a_study_that_is_not_served_any_more_are_kept_if_it_keeps_any(tmp_path: Path, kept: bool) -> None:
+    folder = write_study(tmp_path / "study")
+    config = (folder / "config.yml").read_text()
+    if not kept:
+        (folder / "config.yml").write_text(config.replace("trial:\n", "trial:\n  s3upload: false\n"))
+    data, state, recording = tmp_path / "data", tmp_path / "state", f"quick/users/ada/trials/{NAME}/2-trial.jsonl.gz"
+    first = LocalPlatform(data, state, project_folder=folder, handlers={})
+    installed.use(first)
+    first.publish()
+    part = state / "spool" / f"{recording}.part"
+    part.parent.mkdir(parents=True)
+    part.write_bytes(b"half a game")
+    (folder / "config.yml").write_text(config.replace("id: quick", "id: another"))
+    later = LocalPlatform(data, state, project_folder=folder, handlers={})
+    installed.use(later)
+    later.publish()
+    later.start()
+    later.close()
+    assert (data / recording).exists() is kept
 
 
 def test_unfinished_files_of_a_killed_process_are_deleted(tmp_path: Path) -> None:

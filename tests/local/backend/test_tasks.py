@@ -18,7 +18,7 @@ from websockets.sync.client import connect
 
 from hippodrome.control.model import messages
 from hippodrome.control.ports import Address, Refused, TaskRequest
-from hippodrome.local.backend import task_process
+from hippodrome.local.backend import processes, task_process
 from hippodrome.local.backend import tasks as tasks_module
 from hippodrome.local.backend.processes import end_everything, marked
 from hippodrome.local.backend.tasks import ProcessTasks
@@ -52,12 +52,12 @@ class Here:
         made = ProcessTasks(
             self.state,
             self.data,
-            self.project,
             self.events.append,
             command=command,
             stop_timeout=stop_timeout,
             say=lambda text: None,
         )
+        made.add_project("study", self.project)
         self.made.append(made)
         return made
 
@@ -135,14 +135,14 @@ def test_only_servers_of_projects_with_a_language_model_get_its_key(
     here: Here, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("LLM_KEY", "sk-1")
-    tasks, names = here.tasks(), [f"s{letter * 20}-1" for letter in "abc"]
+    tasks, names = here.tasks(), [f"s{letter * 20}-1" for letter in "ab"]
     tasks.add_project("talks", here.project, has_model=True)
     tasks.add_project("plays", here.project)
-    for name, project in zip(names, ("talks", "plays", "unknown"), strict=True):
+    for name, project in zip(names, ("talks", "plays"), strict=True):
         tasks.run(request(name, PROJECT_ID=project))
         here.wait("RUNNING", name)
     keys = [{process.environ().get("LLM_KEY") for process in marked(here.state)[name]} for name in names]
-    assert keys == [{"sk-1"}, {None}, {None}]
+    assert keys == [{"sk-1"}, {None}]
 
 
 @pytest.mark.parametrize("status", [0, 3])
@@ -171,6 +171,12 @@ def test_a_task_that_cannot_run_is_refused(here: Here) -> None:
         tasks.run(request())
     assert list(tasks.list()) == []
     assert list((here.state / "tasks").iterdir()) == []
+
+
+def test_a_server_of_a_study_that_is_not_served_here_is_refused(here: Here) -> None:
+    with pytest.raises(Refused, match="not served here"):
+        here.tasks().run(request(PROJECT_ID="another"))
+    assert here.processes() == []
 
 
 def test_stop_does_not_wait_for_the_servers_end(here: Here) -> None:
@@ -222,7 +228,8 @@ from pathlib import Path
 from hippodrome.local.backend.tasks import ProcessTasks
 from tests.local.backend.test_tasks import FAKE, request
 state, data, project = map(Path, sys.argv[1:4])
-tasks = ProcessTasks(state, data, project, lambda event: None, command=FAKE)
+tasks = ProcessTasks(state, data, lambda event: None, command=FAKE)
+tasks.add_project("study", project)
 tasks.run(request(**json.loads(sys.argv[4])))
 os.kill(os.getpid(), signal.SIGKILL)
 """
@@ -240,6 +247,43 @@ def test_servers_that_a_killed_run_has_left_are_ended(
     tasks.run(request())
     here.wait("RUNNING")
     assert len(marked(here.state)) == 1
+
+
+def marked_process(here: Here, code: str, **options: Any) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-X", processes.mark_of(here.state, NAME), "-c", code]
+    return subprocess.Popen(command, **({"start_new_session": True} | options))
+
+
+def test_the_id_of_a_group_that_has_ended_may_be_another_programs(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    server, killed = marked_process(here, "import time; time.sleep(60)"), list[int]()
+    until(here.processes)
+    monkeypatch.setattr(processes, "kill_group", killed.append)
+    end_everything(here.state, 30)  # it ends at SIGTERM
+    server.wait()
+    assert killed == []
+
+
+WORKER = """
+import os, signal, time
+if os.fork() == 0:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    time.sleep(600)
+"""
+
+
+def test_a_worker_that_outlives_its_server_is_ended(here: Here) -> None:
+    marked_process(here, WORKER).wait()
+    [worker] = marked(here.state)[NAME]
+    end_everything(here.state, 0.2)
+    until(lambda: not linux.runs(worker.pid), 5)
+
+
+def test_a_job_of_a_shell_that_only_names_a_server_goes_on(here: Here) -> None:
+    job = marked_process(here, "import time; time.sleep(60)", start_new_session=False, process_group=0)
+    end_everything(here.state, 0.2)
+    assert job.poll() is None
+    job.kill()
+    job.wait()
 
 
 @pytest.mark.parametrize("kept", [True, False])
