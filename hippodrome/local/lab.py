@@ -23,7 +23,7 @@ from hippodrome.control import http
 from hippodrome.control.http import Refusal, Request
 from hippodrome.control.model import ids
 from hippodrome.control.model.project import Project
-from hippodrome.control.participants import forms, frame
+from hippodrome.control.participants import forms, frame, links
 from hippodrome.control.participants.frame import Html
 from hippodrome.control.storage.secret import SecretCache
 from hippodrome.local.backend.platform import LocalPlatform
@@ -150,8 +150,8 @@ class Lab:
 
 
 def _projects_of(event: Mapping[str, Any]) -> set[str]:
-    """The ids of projects that a request names: in its path, its query, or the form of a start or stop request."""
-    request = Request.from_event(event)
+    """The ids of projects that a request names, in whatever spelling: in its path, its query, or a relay's form."""
+    request = links.respelled(Request.from_event(event))
     named: list[object] = [(event.get("pathParameters") or {}).get("projectId"), request.query_value("projectId")]
     if request.path in RELAYS and request.body:
         with contextlib.suppress(Refusal):  # the function refuses it itself

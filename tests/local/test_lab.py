@@ -95,7 +95,8 @@ def test_a_study_that_lies_in_the_data_and_is_not_served_cannot_be_opened(local:
     config.write_text(config.read_text().replace("id: quick", "id: another"))
     one.begin("--host", HOST)
     one.url = one.wait_for_text(r"(http://[\w.]+:\d+)/join")[1]
-    assert httpx.get(f"{one.url}/next?projectId=quick&userId=ada").status_code == 404
+    for name in ("projectId", "projectID", "projectid", "project_id"):
+        assert httpx.get(f"{one.url}/next?{name}=quick&userId=ada").status_code == 404
     assert httpx.get(f"{one.url}/steps/another/map.svg").status_code == 200
     assert httpx.get(f"{one.url}/steps/quick/map.svg").status_code == 404
     for relay in ("start", "stop"):
