@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -25,3 +26,8 @@ StudyFolders = Annotated[
     ),
 ]
 """The same for a command that may be given several folders."""
+
+
+def folder_argument(folder: Path) -> str:
+    """Return the argument that names a study by its folder in every command; a word alone may be an id there."""
+    return shlex.quote(str(folder) if len(folder.parts) > 1 else f"{folder}/")

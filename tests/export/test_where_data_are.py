@@ -97,7 +97,7 @@ def test_data_that_may_be_in_two_places_are_not_guessed(
     assert main([*command, "my-study/"]) == Exit.MISUSE
     said = capsys.readouterr().err
     typed = "hippodrome data" if command == ["data"] else "hippodrome erase USER_ID"
-    assert f"  {typed} my-study --from my-study/data\n  {typed} my-study --aws\n" in said
+    assert f"  {typed} my-study/ --from my-study/data\n  {typed} my-study/ --aws\n" in said
     monkeypatch.chdir(folder)
     assert main(command) == Exit.MISUSE
     assert f"  {typed} --from data\n  {typed} --aws\n" in capsys.readouterr().err

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import yaml
 
+from hippodrome.deployment.core.study_selection import selected
+from hippodrome.local.rehearsal.command import _how_to_read
 from hippodrome.local.rehearsal.study_process import copy_of
 from hippodrome.trial.policies.places import _file
 
@@ -40,3 +43,14 @@ def test_no_bot_waits_for_the_least_time_of_a_page(tmp_path: Path) -> None:
     (project / "config.yml").write_text(yaml.safe_dump({"project": {"id": "slow", "steps": steps}}))
     assert "no page has `minSeconds`" in copy_of(project, copy)
     assert "minSeconds" not in (copy / "config.yml").read_text()
+
+
+def test_the_line_that_makes_tables_works_if_the_folder_is_not_named_as_the_study(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / "config.yml").write_text("project: {id: maze}\n")
+    monkeypatch.chdir(tmp_path)
+    line = _how_to_read(Path("s"), Path("s/data-try/try-1"))
+    assert line.endswith("hippodrome data s/ --from s/data-try/try-1")
+    assert selected("s/").id == "maze"

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hippodrome.console import screen
+from hippodrome.console.arguments import folder_argument
 from hippodrome.console.problem import Exit, Problem
 from hippodrome.control.model import ids
 
@@ -29,7 +30,7 @@ class StudySelection:
         """The argument that names this study on the command line, after a space; "" in the study's own folder."""
         if self.folder is None:
             return f" {self.id}"
-        return "" if self.folder == Path() else f" {shlex.quote(str(self.folder))}"
+        return "" if self.folder == Path() else f" {folder_argument(self.folder)}"
 
 
 def selected(given: str | None) -> StudySelection:

@@ -25,7 +25,7 @@ from hippodrome.bots.addresses import THIS_MACHINE, AddressRefused
 from hippodrome.bots.crowd import SIGNALS, interruptible
 from hippodrome.bots.links import with_project
 from hippodrome.bots.report import BotReport
-from hippodrome.console.arguments import StudyFolder
+from hippodrome.console.arguments import StudyFolder, folder_argument
 from hippodrome.console.problem import Problem
 from hippodrome.console.program import as_typed
 from hippodrome.control.config import Config, ConfigErrors, read_project
@@ -125,7 +125,7 @@ def _data_of_bots(folder: Path, project_id: str, data: Path | None) -> Path:
 
 def _how_to_read(folder: Path, data: Path) -> str:
     """Where the data are, and the command that makes tables of them."""
-    study = "" if folder.resolve() == Path.cwd() else f" {shlex.quote(str(folder))}"
+    study = "" if folder.resolve() == Path.cwd() else f" {folder_argument(folder)}"
     command = f"hippodrome data{study} --from {shlex.quote(str(data))}"
     return f"The bots' data are in {data}. This makes tables of them: {command}"
 
