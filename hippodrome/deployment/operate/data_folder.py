@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from hippodrome.protocol import disk
 
 SCRATCH = ".erase"
 """The folder for files that are being written."""
+_UNFINISHED = re.compile(r"\.[0-9a-f]{16}\.new")  # as `protocol/disk.py` names a file that is being written
 
 
 class DataFolder:
@@ -22,15 +24,19 @@ class DataFolder:
         self.root = root.resolve()
 
     def versions(self, prefix: str) -> Iterator[Version]:
+        return (file for file in self._files(prefix) if not _UNFINISHED.fullmatch(Path(file.key).name))
+
+    def uploads(self, prefix: str) -> Iterator[Version]:
+        """Yield the files that a process was writing when it was killed."""
+        return (file for file in self._files(prefix) if _UNFINISHED.fullmatch(Path(file.key).name))
+
+    def _files(self, prefix: str) -> Iterator[Version]:
         for top, _, names in os.walk(self.root / prefix.rpartition("/")[0]):
             for name in sorted(names):
                 path = Path(top, name)
                 key = path.relative_to(self.root).as_posix()
                 if key.startswith(prefix):
                     yield Version(key, "", path.stat().st_size, latest=True)
-
-    def uploads(self, prefix: str) -> Iterator[Version]:
-        return iter(())  # a file appears whole
 
     def read(self, version: Version) -> bytes:
         return (self.root / version.key).read_bytes()

@@ -44,7 +44,8 @@ from hippodrome.protocol.keys import (
 )
 
 AT_ONCE = 10  # documents that are read at the same time
-_PLAYED = re.compile(r"\.jsonl\.gz$|/trials/[^/]+/[^/]+-talk-[0-9]+\.json$")  # a recording, or a piece of a tape
+TRIES = 5  # at a document that a function writes again and again
+_PLAYED = re.compile(r"\.jsonl\.gz(\.part)?$|/trials/[^/]+/[^/]+-talk-[0-9]+\.json$")  # a recording, a piece of a tape
 _SERVER = re.compile(r"s[a-z2-7]{20}(?=[-.])")
 
 
@@ -115,7 +116,7 @@ class Eraser:
     def look(self) -> Found:
         """Find everything about this participant. Changes nothing."""
         own = [*self._in_lobby(), *self._own()]
-        shared = [key for key in self._shared() if key not in self.unreadable and self._names(self._body(key))]
+        shared = [key for key in self._shared() if key not in self.unreadable and self._naming(self._versions_of(key))]
         return Found(own, shared, self.sessions())
 
     def sessions(self) -> list[FoundSession]:
@@ -167,8 +168,7 @@ class Eraser:
         """Return their entries, and the questions to the function `match`, and its answers, that name them."""
         folders = (questions_folder(self.project), groups_folder(self.project))
         asked = [version for folder in folders for version in self._store.versions(folder)]
-        naming = [version for version, body in zip(asked, self._read(asked), strict=True) if self._names(body)]
-        return [*self._store.versions(entries.prefix_of(self.project, self._label)), *naming]
+        return [*self._store.versions(entries.prefix_of(self.project, self._label)), *self._naming(asked)]
 
     def _shared(self) -> dict[str, Callable[[bytes], bytes]]:
         """Return the keys of small documents that all participants share, each with the function that erases in it.
@@ -184,6 +184,12 @@ class Eraser:
 
     def _names(self, body: bytes) -> bool:
         return self._label.encode() in body or f'"{self.user}"'.encode() in body
+
+    def _naming(self, versions: Sequence[Version]) -> list[Version]:
+        """Return those of these versions that name the participant. It keeps no content: there may be thousands."""
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            named = pool.map(lambda version: self._names(self._store.read(version)), versions)
+            return [version for version, names in zip(versions, named, strict=True) if names]
 
     def _versions_of(self, key: str) -> list[Version]:
         return [version for version in self._store.versions(key) if version.key == key]
@@ -208,13 +214,14 @@ class Eraser:
         """
         self._advance = advance
         for session in self.sessions():
-            self._leave(session)
+            self.leave(session)
         for key, without in self._shared().items():
             self._rewrite(key, without)
         self._delete(self._in_lobby())  # the lobby asks `match` again, without the participant
         self._delete(self._own())
 
-    def _leave(self, session: FoundSession) -> None:
+    def leave(self, session: FoundSession) -> None:
+        """Take the participant out of this session's documents; after the last member, delete the session."""
         folder, document = session_folder(self.project, session.id), session_key(self.project, session.id)
         keys = dict.fromkeys(version.key for version in self._store.versions(folder))
         for key in filter(_PLAYED.search, keys):
@@ -230,17 +237,22 @@ class Eraser:
         self._delete(self._versions_of(document))
 
     def _rewrite(self, key: str, without: Callable[[bytes], bytes]) -> None:
-        """Write a document anew if it names the participant, unless somebody else writes it; delete its history."""
-        body = self._body(key)
-        if self._names(body):
+        """Write a document anew if it names the participant, and delete its history.
+
+        After `TRIES` that others' writes have refused, its newest version still names them, and a look finds it.
+        """
+        for _ in range(TRIES):
+            body = self._body(key)
+            if not self._names(body):
+                break
             try:
                 after = without(body)
             except ValueError:
                 self.unreadable[key] = None
                 return
-            if not self._store.replace(key, body, after):
-                return
-            self.rewritten[self._nameless(key)] = None
+            if self._store.replace(key, body, after):
+                self.rewritten[self._nameless(key)] = None
+                break
         self._delete_earlier(key)
 
     def _rewrite_played(self, key: str, seat: int) -> None:

@@ -1,7 +1,8 @@
 """Erases one participant on this machine, from a data folder that `hippodrome run` or `hippodrome try` has filled.
 
-`run` must not run meanwhile: its servers write recordings, and its functions read records. It keeps its own state
-beside the data folder, in `.hippodrome/`, and there too the data that `hippodrome run --fresh` has moved aside.
+`run` must not run meanwhile, nor a server that it has left: servers write recordings, and functions read records. It
+keeps its own state beside the data folder, in `.hippodrome/`, and there too the data that `hippodrome run --fresh` has
+moved aside.
 """
 
 from __future__ import annotations
@@ -9,20 +10,21 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import getpass
-import json
 import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+
+import psutil
 
 from hippodrome.console.problem import Problem
 from hippodrome.control.model import ids
 from hippodrome.control.model.project import MASTER_LIST, read_list
-from hippodrome.deployment.operate.data_folder import DataFolder
+from hippodrome.deployment.core.server_records import warm_servers_of
+from hippodrome.deployment.operate.data_folder import SCRATCH, DataFolder
 from hippodrome.deployment.operate.eraser import Eraser
-from hippodrome.protocol.keys import participant_folder, session_folder, sessions_folder
+from hippodrome.protocol.keys import participant_folder, sessions_folder
 
 STATE = ".hippodrome"
 """Where `hippodrome run` keeps tasks, messages and unfinished recordings, beside the data folder."""
@@ -46,22 +48,31 @@ class FolderErasure:
         return self.eraser.look().counts()
 
     def run(self, advance: Callable[[int], object] = lambda number: None) -> dict[str, int]:
-        """Erase the participant, and return what is left. Raises `Problem` if `run` runs, or has left a server or an
-        unfinished recording."""
+        """Erase the participant, and return what is left. Raises `Problem` if `run` or a server of it runs."""
         with self._locked():
             self._must_be_over()
-            self._delete_state()
+            self._erase_state()
             self.eraser.erase(advance)
             self._folder.remove_unfinished()
             return self.look()
 
-    def _delete_state(self) -> None:
-        """Delete what `run` keeps of the participant alone: unfinished recordings, tasks and logs."""
-        label = ids.server_label(self.project, self.eraser.user)
-        shutil.rmtree(self._state / "spool" / participant_folder(self.project, self.eraser.user), ignore_errors=True)
-        for folder in ("tasks", "logs"):
-            for file in (self._state / folder).glob(f"{label}*"):
-                file.unlink()
+    def _erase_state(self) -> None:
+        """Erase the participant from what `run` keeps: unfinished documents and recordings, tasks and logs.
+
+        Recordings of their sessions lie there if `run` was killed, or if the study keeps none (`s3upload`).
+        """
+        spool, sessions = DataFolder(self._state / "spool"), self.eraser.sessions()
+        unfinished = Eraser(spool, self.project, self.eraser.user)
+        for session in sessions:
+            unfinished.leave(session)
+        own = spool.root / participant_folder(self.project, self.eraser.user)
+        for folder in (own, spool.root / SCRATCH, self._state / "scratch", self._folder.root / ".scratch"):
+            if folder.exists():
+                shutil.rmtree(folder)
+        for owner in (self.eraser.user, *(session.id for session in sessions if not session.others)):
+            for name in (ids.server_label(self.project, owner), *warm_servers_of(self.eraser.record(owner))):
+                for file in (*self._state.glob(f"tasks/{name}[-.]*"), *self._state.glob(f"logs/{name}[-.]*")):
+                    file.unlink()
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
@@ -81,29 +92,16 @@ class FolderErasure:
             yield
 
     def _must_be_over(self) -> None:
-        """Raise `Problem` if a killed `run` has left a running server, or recordings that it has not moved."""
-        theirs = [session_folder(self.project, session.id) for session in self.eraser.sessions()]
-        folders = {participant_folder(self.project, self.eraser.user), *theirs}
-        runs = any(_runs(path, folders) for path in sorted((self._state / "tasks").glob("*")))
-        unfinished = any(path.is_file() for folder in theirs for path in (self._state / "spool" / folder).rglob("*"))
-        if runs or unfinished:
-            raise Problem(
-                "Their server still runs, or its recording is unfinished: `run` was killed. Nothing was touched.",
-                "Start `hippodrome run` once more and end it with Ctrl-C: it ends all servers and keeps what they "
-                "recorded.",
-            )
-
-
-def _runs(path: Path, folders: set[str]) -> bool:
-    """Whether this file describes a task for one of these folders whose process is alive."""
-    try:
-        task: dict[str, Any] = json.loads(path.read_bytes())
-        if f"{task.get('folder', '').rstrip('/')}/" not in folders or task.get("stopped"):
-            return False
-        os.kill(int(task["pid"]), 0)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
-        return False
-    return True
+        """Raise `Problem` if a killed `run` has left a server: it may still store what is about the participant."""
+        mark = f"hippodrome={self._state.resolve()}/tasks/"  # as in `hippodrome/local/backend/processes.py`
+        for process in psutil.process_iter():
+            with contextlib.suppress(psutil.Error):
+                if any(word.startswith(mark) for word in process.cmdline()):
+                    raise Problem(
+                        "A server still runs here: `run` was killed. Nothing was touched.",
+                        "Start `hippodrome run` once more and end it with Ctrl-C: it ends all servers and keeps what "
+                        "they recorded.",
+                    )
 
 
 def erasures(data: Path, only: str | None, user: str) -> list[FolderErasure]:

@@ -72,7 +72,7 @@ class Shared:
         return self.state / "logs" / f"{name}.log"
 
     def note(self, name: str) -> Path:
-        """Return the file that says of a running server whose it is: `erase` reads it."""
+        """Return the file that says of a running server whose it is, and its process id."""
         return self.state / "tasks" / f"{name}.json"
 
     @property

@@ -20,8 +20,11 @@ from botocore.client import BaseClient
 from hippodrome.console.problem import Exit
 from hippodrome.control.aws.tasks import EcsTasks
 from hippodrome.control.limits.slots import Slots
+from hippodrome.control.lobby import decisions
+from hippodrome.control.lobby.decisions import Decisions, Unmatched
 from hippodrome.control.model import ids
 from hippodrome.control.model.messages import StartServer, parse_task_changed
+from hippodrome.control.model.records import to_json
 from hippodrome.control.model.server import ServerState
 from hippodrome.control.ports import RunningTask, TaskRequest
 from hippodrome.control.servers.signing import STORE_AFTER_CLOSE, VALID_SECONDS
@@ -343,6 +346,37 @@ def test_a_participant_who_returns_meanwhile_is_erased_again(world: Installed, m
     assert not erases(world)
     assert rounds == [3]
     assert traces(world, ANN) == []
+
+
+@pytest.mark.parametrize(
+    ("owner", "method", "naming"),
+    [(VersionedBucket, "replace", ()), (Eraser, "_in_lobby", ("SECRETCODE",))],
+    ids=["while it replaces them", "after its own version"],
+)
+def test_a_lobby_that_writes_its_decisions_meanwhile_keeps_no_version_with_the_participant(
+    world: Installed, monkeypatch: Any, owner: Any, method: str, naming: Sequence[str]
+) -> None:
+    """The lobby's newest version no longer names them, but versions before it do."""
+    key, label = decisions.key("maze"), ids.server_label("maze", ANN)
+    newest = to_json(Decisions(9))
+    whole = getattr(owner, method)
+
+    def store(code: str) -> None:
+        world.put(key, to_json(Decisions(1, unmatched=(Unmatched(label, ANN, world.platform.now(), code),))))
+
+    def race(self: Any, *args: Any) -> Any:
+        monkeypatch.setattr(owner, method, whole)
+        for past in naming:
+            store(past)
+        world.put(key, newest)
+        return whole(self, *args)
+
+    world.participant(ANN, answered=2)
+    store("SECRETCODE")
+    monkeypatch.setattr(owner, method, race)
+    assert not erases(world)
+    assert not [body for body in bodies(world) if label.encode() in body or b"SECRETCODE" in body]
+    assert world.get(key) == newest
 
 
 def test_erase_reports_a_participant_who_keeps_returning(world: Installed, capsys: Any, monkeypatch: Any) -> None:

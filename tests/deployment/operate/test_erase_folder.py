@@ -8,6 +8,9 @@ import gzip
 import itertools
 import json
 import os
+import subprocess
+import sys
+import zlib
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,6 +32,7 @@ from hippodrome.deployment.operate import folder_erasure
 from hippodrome.deployment.operate.data_folder import DataFolder
 from hippodrome.deployment.operate.eraser import Eraser
 from hippodrome.deployment.operate.folder_erasure import FolderErasure
+from hippodrome.local.backend.processes import mark_of
 from hippodrome.protocol.handover import Handover
 from hippodrome.protocol.keys import handover_key, session_key
 from hippodrome.protocol.session import parse
@@ -194,20 +198,67 @@ def test_a_study_that_is_running_is_not_changed(machine: Machine) -> None:
     assert machine.erase("--yes").code == Exit.DONE
 
 
-@pytest.mark.parametrize("left", ["a server that runs", "an unfinished recording"])
-def test_erase_first_finishes_what_a_killed_run_has_left(machine: Machine, left: str) -> None:
+@pytest.mark.parametrize("folder", ["", f"maze/sessions/{SID}"], ids=["a warm server", "a server of their session"])
+def test_while_a_server_of_a_killed_run_plays_on_nothing_is_erased(machine: Machine, folder: str) -> None:
+    """A warm server that was just assigned has no note yet of whose it is."""
     pair(machine.put, machine.tmp)
     before = machine.contents()
     state = machine.tmp / ".hippodrome" / "data"
-    put = into_folder(state)
-    if left == "a server that runs":
-        task = {"folder": f"maze/sessions/{SID}", "pid": os.getpid(), "stopped": None}
-        put("tasks/s-1.json", json.dumps(task).encode())
-    else:
-        put(f"spool/{recording_key()}.part", b"")
-    ran = machine.erase("--yes")
+    into_folder(state)("tasks/s-1.json", json.dumps({"folder": folder, "pid": 1}).encode())
+    sleep = [sys.executable, "-X", mark_of(state, "s-1"), "-c", "import time; time.sleep(600)"]
+    with subprocess.Popen(sleep, start_new_session=True) as server:
+        try:
+            ran = machine.erase("--yes")
+        finally:
+            server.kill()
     assert (ran.code, "Start `hippodrome run` once more" in ran.err) == (Exit.FAILED, True)
     assert machine.contents() == before
+    assert machine.erase("--yes").code == Exit.DONE
+
+
+@pytest.mark.parametrize("name", ["3-episode-0001.jsonl.gz.part", "3-episode-0001.jsonl.gz"])
+@pytest.mark.parametrize("state", [".hippodrome/data", ".hippodrome/earlier/data-20261121-144640/state"])
+def test_recordings_of_their_session_that_were_never_moved_to_the_data_lose_them_too(
+    machine: Machine, state: str, name: str
+) -> None:
+    """`run` was killed, perhaps `run --fresh` followed; or the study keeps no recordings (`s3upload: false`)."""
+    folder = machine.tmp / state
+    put = machine.put if state.endswith("data") else into_folder(folder.parent / "data")
+    machine.put(f"maze/users/{ANN}/participant.json", b"{}")
+    pair(put, machine.tmp)
+    left = folder / "spool" / f"{recording_key().rpartition('/')[0]}/{name}"
+    into_folder(folder)(f"spool/{recording_key().rpartition('/')[0]}/{name}", packed(machine.tmp, lines(), close=False))
+    assert machine.erase("--yes").code == Exit.DONE
+    assert machine.traces() == []
+    told = zlib.decompressobj(31).decompress(left.read_bytes())
+    assert (said(BOB).encode() in told, said(ANN).encode() in told) == (True, False)
+    assert machine.erase("--yes", user=BOB).code == Exit.DONE
+    assert not left.exists()
+
+
+def test_documents_that_were_half_written_when_run_was_killed_are_deleted(machine: Machine) -> None:
+    pair(machine.put, machine.tmp)
+    half = f"Jane Doe, {ANN}".encode()
+    into_folder(machine.tmp / ".hippodrome" / "data")("scratch/.0123456789abcdef.new", half)
+    machine.put(".scratch/.0123456789abcdef.new", half)
+    machine.put(f"{tape_key().rpartition('/')[0]}/.0123456789abcdef.new", half)
+    machine.put(f"maze/users/{ANN}/answers/.0123456789abcdef.new", half)
+    ran = machine.erase("--yes")
+    assert (ran.code, "still names them" in ran.err) == (Exit.DONE, False)
+    assert not list(machine.tmp.rglob("*.new"))
+
+
+def test_the_logs_of_their_warm_servers_are_erased(machine: Machine) -> None:
+    now = datetime.now(UTC)
+    hers, others = (ids.server_name(ids.server_label("maze", f"~warm{n}"), 1) for n in range(2))
+    record = Server("maze", ANN, 1, ServerState.CLOSED, now, now, "c", warm_server_name=hers)
+    machine.put(f"maze/users/{ANN}/participant.json", b"{}")
+    machine.put(server.key(record.label), to_json(record))
+    put = into_folder(machine.tmp / ".hippodrome" / "data")
+    for name in (hers, others):
+        put(f"logs/{name}.log", b"Jane Doe says hello")
+    assert machine.erase("--yes").code == Exit.DONE
+    assert [path.name for path in (machine.tmp / ".hippodrome/data/logs").iterdir()] == [f"{others}.log"]
 
 
 def test_documents_of_local_functions_that_name_the_participant_are_reported(machine: Machine) -> None:

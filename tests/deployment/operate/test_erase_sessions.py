@@ -232,13 +232,13 @@ def test_erase_first_stops_a_session_that_plays(
     pair(world.put, tmp_path)
     start(world)
     order: list[str] = []
-    rewrite = Eraser._leave
+    rewrite = Eraser.leave
 
     def leave(self: Eraser, found: Any) -> None:
         order.append("while it ran" if list(world.platform.tasks.list()) else "rewritten")
         rewrite(self, found)
 
-    monkeypatch.setattr(Eraser, "_leave", leave)
+    monkeypatch.setattr(Eraser, "leave", leave)
     ran = erase(world, capsys)
     assert ran.code == Exit.DONE, ran.err
     assert "1 session will be stopped, for all who play there" in ran.err
