@@ -45,6 +45,16 @@ class Reader:
         assert found, text
         (self.folder / found[1]).write_text(text, encoding="utf-8")
 
+    def change(self, text: str) -> None:
+        """Replace the line after `-` by that after `+`, in the file that the block's first line names."""
+        found = NAME.match(text)
+        assert found, text
+        file = self.folder / found[1]
+        old, new = (re.findall(rf"(?m)^\{sign}(.*)", text) for sign in "-+")
+        page = file.read_text(encoding="utf-8")
+        assert page.count(old[0]) == 1, f"{file} has not once: {old[0]}"
+        file.write_text(page.replace(old[0], new[0]), encoding="utf-8")
+
     def type(self, command: str) -> str:
         """Run a command; return what it prints."""
         done = subprocess.run(
@@ -85,7 +95,7 @@ def test_the_tutorial_leads_to_a_figure(tmp_path: Path) -> None:
     reader = Reader(tmp_path)
     for language, text in blocks():
         if language != "console":
-            reader.write(text)
+            (reader.change if language == "diff" else reader.write)(text)
             continue
         for part in re.split(r"(?m)^\$ ", text)[1:]:
             command, *shown = part.splitlines()
