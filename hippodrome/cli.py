@@ -66,7 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         screen.warning("Interrupted. The same command goes on from here.")
         return Exit.INTERRUPTED
     except TyperException as misuse:
-        screen.show_problem(Problem(misuse.format_message(), "--help tells what a command takes."))
+        screen.show_problem(
+            Problem(misuse.format_message().replace(" Value error,", ""), "--help tells what a command takes.")
+        )
         return misuse.exit_code
     except Exception as error:
         if os.environ.get("HIPPODROME_DEBUG"):

@@ -29,6 +29,11 @@ def test_help_lists_every_command_in_its_group_and_fits_a_terminal(
     assert max(map(len, shown.splitlines())) <= 80
 
 
+def test_a_word_that_is_no_choice_is_refused_with_the_choices(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["secret", "my-study"]) == 2
+    assert "Invalid value for 'action': 'my-study' is not one of 'set', 'list', 'remove'." in capsys.readouterr().err
+
+
 def test_without_a_command_the_help_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     assert "On this machine:" in capsys.readouterr().out

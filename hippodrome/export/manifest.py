@@ -82,13 +82,15 @@ def check(folder: Path) -> list[str]:
     about, private = read(folder), read(folder / "private")
     if about is None:
         raise Problem(f"There is no {NAME} in {folder}.", "Name the folder that `data` has filled.")
+    return [*_damaged(folder, about["files"]), *_damaged(folder, private["files"] if private else [])]
+
+
+def foreign(folder: Path) -> list[str]:
+    """Return the paths of files outside of `private/` that the folder's manifest does not list. Raises `Problem` if it
+    is damaged."""
+    about = read(folder) or {"files": []}
     known = {NAME, *(file.path for file in about["files"])}
-    unknown = [path for path in _shared(folder) if path not in known]
-    return [
-        *_damaged(folder, about["files"]),
-        *(f"{path} is not in the manifest" for path in unknown),
-        *_damaged(folder, private["files"] if private else []),
-    ]
+    return sorted(path for path in _shared(folder) if path not in known)
 
 
 def _damaged(folder: Path, files: Iterable[ExportedFile]) -> list[str]:

@@ -80,8 +80,16 @@ def make_study(template: StudyTemplate, folder: Path) -> str:
         _write_id(folder, project_id)
         _adapt_paths(template, folder)
     except OSError as error:
-        raise Problem(f"{folder} cannot be written: {error.strerror or error}.") from None
+        raise Problem(_not_written(folder, error)) from None
     return project_id
+
+
+def _not_written(folder: Path, error: OSError) -> str:
+    """Say why the folder cannot be written. A copied tree's error lists a source, a target and a reason per file."""
+    if isinstance(error, shutil.Error):
+        _, target, reason = error.args[0][0]
+        return f"{target} cannot be written: {reason.partition('] ')[2].partition(': ')[0] or reason}."
+    return f"{folder} cannot be written: {error.strerror or error}."
 
 
 def what_next(folder: Path) -> str:

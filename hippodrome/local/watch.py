@@ -11,6 +11,7 @@ from pathlib import Path
 from hippodrome.control.config import Config, Diagnostic, layout
 from hippodrome.local.backend.files import names
 from hippodrome.local.backend.retry import message_for
+from hippodrome.local.check.agent_file import read_module
 from hippodrome.local.check.command import check_project
 from hippodrome.local.publish import NotPublished, step_files
 
@@ -72,15 +73,22 @@ class Watch:
             last = file_times
 
     def _changed(self, changed: list[str]) -> None:
+        unreadable: list[Diagnostic] = []
         for name in changed:
             exists = name in self._known
-            later = ": servers that start from now on run it" if name.endswith(".py") and exists else ""
-            self._say(f"{name}{' changed' if exists else ' is gone'}{later}")
+            is_code = name.endswith(".py") and exists
+            mistakes = read_module(self._folder / name, name) if is_code else []
+            for mistake in mistakes:
+                self._say(f"{mistake}; servers that start from now on fail until it is mended")
+            if not mistakes:
+                later = ": servers that start from now on run it" if is_code else ""
+                self._say(f"{name}{' changed' if exists else ' is gone'}{later}")
+            unreadable += mistakes
         warm = self._config.project.warm_servers  # warm servers run the code with which they started
         if warm or not all(name.endswith(".py") for name in changed):
             self._publish()
         if not self._held_back:
-            self._check(changed)
+            self._check(changed, unreadable)
 
     def _publish(self) -> None:
         held_back, self._held_back = self._held_back, True
@@ -103,15 +111,15 @@ class Watch:
             if held_back:
                 self._say("The project is fine again, and the study goes on as it says now")
 
-    def _check(self, changed: Collection[str] = ()) -> None:
-        """Show the problems of pages and agent.py that are new or concern the changed files."""
+    def _check(self, changed: Collection[str] = (), shown: Collection[Diagnostic] = ()) -> None:
+        """Show the problems of pages and agent.py that are new or concern the changed files, without those `shown`."""
         try:
             found = check_project(self._folder, self._config)
         except Exception as error:  # noqa: BLE001 - the study goes on
             self._say(f"The pages could not be checked: {type(error).__name__}: {error}")
             return
         for problem in found:
-            if problem not in self._wrong or problem.file in changed:
+            if problem not in shown and (problem not in self._wrong or problem.file in changed):
                 self._say(str(problem))
         before, self._wrong = self._wrong, set(found)
         if _mistaken(before) and not _mistaken(self._wrong):

@@ -408,14 +408,22 @@ def test_a_damaged_file_is_found_by_its_hash_and_made_again(place: Place, how: s
     (place.out / "recordings" / "stray.txt").write_text("somebody's")
     checked = place.run("--check", "--json")
     assert checked.code == Exit.FAILED
-    assert [line.split(" ")[0] for line in checked.json["wrong"]] == [
-        "recordings/user-0001/1/3-episode-0001.parquet",
-        "recordings/stray.txt",
-    ]
+    assert [line.split(" ")[0] for line in checked.json["wrong"]] == ["recordings/user-0001/1/3-episode-0001.parquet"]
+    assert checked.json["foreign"] == ["recordings/stray.txt"]
     (place.out / "recordings" / "stray.txt").unlink()
     told = place.done()
     assert (told["run"]["damaged"], told["run"]["changed"]) == (1, 1)
     assert place.listed() == before
+
+
+def test_a_file_of_somebody_else_in_the_folder_is_named_and_is_no_damage(place: Place) -> None:
+    crowd(place.put, place.tmp, 2)
+    place.done()
+    (place.out / "note.txt").write_text("somebody's")
+    checked = place.run("--check")
+    assert checked.code == Exit.DONE
+    assert "Not in the manifest: note.txt." in checked.err
+    assert "they may be moved away" in " ".join(checked.err.split())
 
 
 def test_a_damaged_manifest_is_reported_and_written_again(place: Place) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
@@ -166,6 +167,18 @@ def test_a_place_where_nothing_can_be_written_is_reported_in_a_sentence(root: Pa
     (tmp_path / "file").write_text("")
     with pytest.raises(Problem, match="cannot be written: Not a directory"):
         new.make_study(new.templates(root)["maze"], tmp_path / "file" / "mine")
+
+
+def test_a_disk_that_fills_up_is_reported_with_the_first_file_that_did_not_fit(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def copyfile(source: str, target: str, **_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), source, None, target)
+
+    monkeypatch.setattr(shutil, "copyfile", copyfile)
+    with pytest.raises(Problem) as told:
+        new.make_study(new.templates(root)["maze"], tmp_path / "mine")
+    assert re.fullmatch(rf"{tmp_path}/mine/\S+ cannot be written: No space left on device\.", str(told.value))
 
 
 def test_a_folder_with_an_unreadable_config_is_no_template(root: Path) -> None:

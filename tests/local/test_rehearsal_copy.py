@@ -1,15 +1,20 @@
-"""The copy of a project that bots walk through."""
+"""The copy of a project that bots walk through, and the study that runs it."""
 
 from __future__ import annotations
 
+import errno
+import os
+import subprocess
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from hippodrome.deployment.core.study_selection import selected
 from hippodrome.local.rehearsal.command import _how_to_read
-from hippodrome.local.rehearsal.study_process import copy_of
+from hippodrome.local.rehearsal.study_process import StudyNotStarted, StudyProcess, copy_of
 from hippodrome.trial.policies.places import _file
 
 CONFIG = """
@@ -54,3 +59,18 @@ def test_the_line_that_makes_tables_works_if_the_folder_is_not_named_as_the_stud
     line = _how_to_read(Path("s"), Path("s/data-try/try-1"))
     assert line.endswith("hippodrome data s/ --from s/data-try/try-1")
     assert selected("s/").id == "maze"
+
+
+def test_a_study_that_cannot_start_on_a_full_disk_says_that_it_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(**_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(StudyProcess, "_begin", lambda *_, **options: subprocess.Popen(["true"], **options))
+    study = StudyProcess(tmp_path, tmp_path / "data")
+    with pytest.raises(StudyNotStarted, match="printed nothing into"):
+        study.start()
+    monkeypatch.setattr(tempfile, "TemporaryFile", full)
+    with pytest.raises(StudyNotStarted, match=r"cannot be stored in .*/data: No space left on device\. Make room"):
+        study.start()

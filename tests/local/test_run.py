@@ -232,6 +232,22 @@ def test_an_edited_page_is_shown_after_a_reload(local: Make) -> None:
     assert httpx.get(walker.link).status_code == 404
 
 
+def test_an_agent_saved_with_a_syntax_error_is_reported_in_one_message(local: Make) -> None:
+    here = local(start=2).run()
+    agent = here.folder / "agent.py"
+    good = agent.read_text()
+    agent.write_text(f"{good}\n")
+    here.wait_for_text(r"agent\.py changed: servers that start from now on run it")
+    agent.write_text("def start(:\n")
+    here.wait_for_text(
+        r"agent\.py:1: Python cannot read this: invalid syntax; servers that start from now on fail until it is mended"
+    )
+    agent.write_text(good)
+    here.wait_for_text("No mistakes are left")
+    assert here.text().count("Python cannot read this") == 1
+    assert here.text().count("servers that start from now on run it") == 2
+
+
 def test_the_error_of_a_broken_agent_is_printed(local: Make) -> None:
     here = local()
     agent = here.folder / "agent.py"

@@ -69,7 +69,7 @@ def check_values(
     keys = [key for key in steps if is_step_key(key)] if isinstance(steps, dict) else []
     checked = Checked(ProjectKeys(), ordered(keys), "project" in sections, registered, invalid=list(invalid))
     _check_project({key: value for key, value in sections.items() if key != "trial"}, checked)
-    _check_trial(registered.first_trial, checked)
+    _check_trial(registered, checked)
     _check_design(checked)
     return checked
 
@@ -100,10 +100,14 @@ def _check_project(sections: dict[str, Any], checked: Checked) -> None:
             _note(checked, path, sentence)
 
 
-def _check_trial(trial: Any, checked: Checked) -> None:
+def _check_trial(registered: Design, checked: Checked) -> None:
+    trial = registered.first_trial
+    unknown = [mistake.path for mistake in registered.mistakes if mistake.path[:1] == ("trial",)]
+    checked.invalid += unknown
     checked.trial, problems = check_trial(trial)
     for path, sentence, compared in problems:
-        if not compared:
+        stands_in = any(named[1 : len(path) + 1] == path for named in unknown)  # "x", which nobody wrote, for a factor
+        if not compared and not stands_in:
             _note(checked, ("trial", *path), sentence)
     for path in _unknown_in_trial(trial):
         _note_unknown(checked, path)

@@ -165,14 +165,20 @@ def _bucket(account: Account, stack: str, bucket_name: str | None, project: str)
 def _check(folder: Path, as_json: bool) -> int:
     from hippodrome.export import manifest
 
-    wrong = manifest.check(folder)
+    wrong, foreign = manifest.check(folder), manifest.foreign(folder)
     if as_json:
-        screen.result_json({"folder": str(folder), "sound": not wrong, "wrong": wrong})
+        screen.result_json({"folder": str(folder), "sound": not wrong, "wrong": wrong, "foreign": foreign})
+    if foreign:
+        names = ", ".join(foreign[:20]) + (f" … and {len(foreign) - 20} more" if len(foreign) > 20 else "")
+        screen.warning(
+            f"Not in the manifest: {names}. No table is made of such files, and they may be moved away. If the last "
+            "run was interrupted, run the command without --check first."
+        )
     if not wrong:
         screen.success(f"{folder} is as its manifest says.")
         return Exit.DONE
     raise Problem(
-        f"{len(wrong)} files in {folder} are not as its manifest says.",
+        f"Not as the manifest of {folder} says: {formatting.count(len(wrong), 'file')}.",
         "Run the command without --check: what is damaged is made anew.",
         wrong[:20] + ([f"… and {len(wrong) - 20} more"] if len(wrong) > 20 else []),
     )

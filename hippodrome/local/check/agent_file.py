@@ -22,7 +22,11 @@ def label_of(folder: Path) -> str | None:
 
 def read_agent(folder: Path) -> list[Diagnostic]:
     """Return the mistake for which Python cannot read agent.py, if there is one."""
-    path, label = layout.agent_folder(folder) / AGENT, label_of(folder) or AGENT
+    return read_module(layout.agent_folder(folder) / AGENT, label_of(folder) or AGENT)
+
+
+def read_module(path: Path, label: str) -> list[Diagnostic]:
+    """Return the mistake for which Python cannot read this file, if there is one; messages call it `label`."""
     try:
         source = path.read_bytes() if path.is_file() else b""
     except OSError as error:

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -32,6 +33,7 @@ START_SECONDS = 60.0  # the study must start within so many seconds
 PATIENCE = 30  # seconds: the longest `patience` in the copy of a study
 GONE_SECONDS = 45.0  # after the last bot has ended, the servers must end within so many seconds
 END_SECONDS = 30.0  # local mode must end within so many seconds
+LOG_ROOM = 1 << 16  # bytes: a disk without room for so many is full
 
 _LINK = re.compile(r"http://127\.0\.0\.1:\d+/next\S*")
 
@@ -105,8 +107,20 @@ class StudyProcess:
                 return
             if ended or time.monotonic() > until:
                 self.kill()
-                raise StudyNotStarted(text.strip() or "local mode printed nothing")
+                raise StudyNotStarted(text.strip() or self._why_silent())
             time.sleep(0.05)
+
+    def _why_silent(self) -> str:
+        """Say why local mode left no line: on a full disk, its log cannot hold one."""
+        try:
+            with tempfile.TemporaryFile(dir=self.log.parent) as probe:
+                probe.write(bytes(LOG_ROOM))
+        except OSError as error:
+            return (
+                f"The bots' data cannot be stored in {self.data}: {error.strerror}. Make room there, or name another "
+                "folder with --data."
+            )
+        return f"`hippodrome run` did not start the study, and printed nothing into {self.log}"
 
     def _begin(self, arguments: list[str], **options: Any) -> Process:
         """Start `hippodrome run`; `options` are those of `subprocess.Popen`."""

@@ -132,6 +132,11 @@ def test_the_study_itself_has_no_mistake(tmp_path: Path) -> None:
             "of 2: …",
         ),
         (
+            "agent:{partner}",
+            "{partners}",
+            "config.yml:16: trial.players.partner: there is no factor partners; did you mean partner?",
+        ),
+        (
             "  conditions: {partner: [helpful, lazy], advice: [on, off]}\n",
             "",
             "config.yml:15: trial.players.partner: there is no factor partner; add it to conditions, such as "
