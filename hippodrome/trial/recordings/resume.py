@@ -68,15 +68,25 @@ def _recordings(store: Store, prefix: str, recorded: RecordedTrial) -> Iterable[
 def add_lines(recorded: RecordedTrial, lines: Iterable[Mapping[str, Any]]) -> None:
     """Add the lines of a recording to `recorded`. Lines of unknown kinds and malformed lines are ignored."""
     rate = 30.0
+    last: int | None = None
     for line in lines:
         with contextlib.suppress(AttributeError, KeyError, TypeError, ValueError):
             if line["kind"] == "header":
                 rate = float(line["frameRate"]) or rate
             else:
-                _add_line(recorded, line, rate)
+                seconds = _seconds(line, last) if line["kind"] == "step" else None
+                _add_line(recorded, line, 1.0 / rate if seconds is None else seconds)
+            last = line.get("ns") if line["kind"] == "step" else None
 
 
-def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> None:
+def _seconds(line: Mapping[str, Any], last: int | None) -> float | None:
+    """The time since the step at `last`, both in `ns`; None if the game stood still meanwhile, or it is not known."""
+    messages = line.get("messages") or ()
+    stood = any("event" in message or message.get("command") in ("pause", "start") for message in messages)
+    return None if last is None or stood or "ns" not in line else max(0, line["ns"] - last) / 1e9
+
+
+def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], seconds: float) -> None:
     kind, number, current = line["kind"], int(line["episode"]), recorded.unfinished
     if kind in ("end", "break") and isinstance(line.get("outcomes"), Mapping):
         recorded.outcomes |= {str(player): str(outcome) for player, outcome in line["outcomes"].items()}
@@ -96,7 +106,7 @@ def _add_line(recorded: RecordedTrial, line: Mapping[str, Any], rate: float) -> 
         words = tuple(_feedback(line))
         current.steps.append(_step(line, words))
         current.unheard = []
-        recorded.seconds += 1.0 / rate
+        recorded.seconds += seconds
         if line.get("terminated") or line.get("truncated"):  # over, even if the server was lost before the line `end`
             why = "terminated" if line.get("terminated") else "truncated"
             _end(recorded, current, why, success=recording.succeeded(line.get("info") or {}))

@@ -72,6 +72,12 @@ def test_a_header_without_a_frame_rate_counts_thirty_frames_a_second(rate):
     assert recorded_trial(reset(), step()).seconds == pytest.approx(1 / 30)
 
 
+def test_the_time_of_play_is_that_of_the_steps_and_pauses_do_not_count() -> None:
+    pause = [{"ns": 3, "command": "pause"}]
+    steps = [step(ns=1_000_000_000), step(ns=3_500_000_000), step(ns=9_000_000_000, messages=pause)]
+    assert recorded_trial(header(10), reset(), *steps).seconds == pytest.approx(0.1 + 2.5 + 0.1)
+
+
 def test_a_server_that_was_shut_down_leaves_its_episode_unfinished():
     past = recorded_trial(reset(), step(), end("shutdown"))
     assert past.ended == []
