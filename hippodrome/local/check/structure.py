@@ -47,8 +47,8 @@ class _Structure:
     def __init__(self, label: str, page: PageSource) -> None:
         self._label, self._page = label, page
         self._radios: dict[str, list[_Radio]] = {}
-        self._kinds: dict[tuple[str, int], bool] = {}  # by name and blocks: whether the first field is a radio button
-        self._mixed: dict[str, int] = {}  # by name: the line of the first field that is of the other kind
+        self._kinds: dict[tuple[str, int], str] = {}  # by name and blocks: the kind of the first field
+        self._mixed: dict[str, int] = {}  # by name: the line of the first field that is a question of its own
         self._scripts: list[range] = []
         self._open: list[tuple[str, int]] = []
         self._left: list[tuple[str, int]] = []
@@ -87,7 +87,10 @@ class _Structure:
                 if kind == "radio":
                     radio = _Radio(line, values.get("value"), blocks, fieldset, self._row)
                     self._radios.setdefault(name, []).append(radio)
-                if self._kinds.setdefault((name, blocks), kind == "radio") != (kind == "radio"):
+                first = self._kinds.get((name, blocks))
+                self._kinds.setdefault((name, blocks), kind)
+                is_list = first == kind and kind in ("radio", "checkbox")
+                if first is not None and not is_list and {first, kind} - {"checkbox", "hidden"}:
                     self._mixed.setdefault(name, line)
 
     def _end(self, line: int, tag: str) -> None:
@@ -122,7 +125,7 @@ class _Structure:
                 yield self._mistake(again.line, f"{message}; give each a name of its own")
 
     def mixed(self) -> Iterator[Diagnostic]:
-        """Yield remarks: radio buttons that share their name with a field of another kind, such as a slider.
+        """Yield remarks: fields that share a name, other than the choices of one question.
 
         Only fields between the same {% … %} are compared.
         """

@@ -759,7 +759,7 @@ def test_a_failure_becomes_a_sentence_and_its_log_holds_no_answer(
     platform.documents.before_write.append(fail)
     response = alice.answer(page, consent="secret-answer")
     assert response["statusCode"] == 500
-    assert "Nothing you have sent is lost" in response["body"]
+    assert "reload this page to try again" in response["body"]
     logged = log.getvalue()
     assert "request failed" in logged
     assert "RuntimeError" in logged

@@ -325,9 +325,12 @@ def test_good_questions_and_tags_get_no_finding(folder: Path) -> None:
         (radio("q", "a", "b"), '<textarea name="q"></textarea>'),
         (radio("q", "a", "b"), '<select name="q"><option>1</option></select>'),
         (radio("q", "a", "b"), '<input name="q">'),
+        ('<input name="q">\n', '<input name="q">'),
+        ('<input type="number" name="q">\n', '<select name="q"><option>1</option></select>'),
+        ('<input type="checkbox" name="q" value="a">\n', '<input type="range" name="q">'),
     ],
 )
-def test_a_radio_button_and_another_field_of_the_same_name_are_remarked(folder: Path, first: str, second: str) -> None:
+def test_two_fields_of_the_same_name_are_remarked(folder: Path, first: str, second: str) -> None:
     page(folder, f"<h1>Hello</h1>\n{first}\n{second}")
     said = "steps/hello.html:4: remark: an earlier question has the name q too, so both answers are stored under it, "
     assert looked(folder) == [f"{said}as a list; give each a name of its own"]
@@ -340,6 +343,7 @@ def test_a_radio_button_and_another_field_of_the_same_name_are_remarked(folder: 
         "{% if group %}" + radio("q", "a", "b") + '{% else %}<input type="range" name="q">{% endif %}',
         '{% for i in range(2) %}<input type="radio" name="q{{ i }}" value="a">{% endfor %}<input name="q{{ group }}">',
         '<input type="checkbox" name="q" value="a"><input type="checkbox" name="q" value="b">',
+        '<input type="hidden" name="q" value="no"><input type="checkbox" name="q" value="yes">',
         '<input name=""><input type="radio" name="" value="a">',
     ],
 )
