@@ -115,8 +115,9 @@ def test_a_running_study_reports_mistakes_in_changed_files(folder: Path, tmp_pat
         "The project is fine again, and the study goes on as it says now"
     ]
     assert told("config.yml") == []
-    assert told("agent.py", change=lambda: agent(folder, "class Agent:", "class Agent")) == [
-        "agent.py:15: Python cannot read this: expected ':'"
+    told("agent.py", change=lambda: agent(folder, "class Agent:", "class Agent"))
+    assert said == [
+        "agent.py:15: Python cannot read this: expected ':'; servers that start from now on fail until it is mended"
     ]
     platform.close()
 
