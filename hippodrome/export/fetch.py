@@ -151,15 +151,13 @@ class Fetcher:
             yield "", strays
 
     def forget_gone(self) -> int:
-        """Remove those who have no file in the source any more, such as an erased participant; return how many files
-        they had."""
+        """Forget those who have no file in the source any more, such as an erased participant; return how many files
+        they had. `remove_unnamed` then removes what was exported of them."""
         count = 0
         for name in self._records.names - self._seen:
             record = self._records.load(name)
             count += len(record.files) if record else 0
             if not self._wanted.dry:
-                for file in record.files.values() if record else ():
-                    self._remove(file)
                 self._records.remove(name)
         return count
 

@@ -19,6 +19,7 @@ import typer
 
 from hippodrome.console.arguments import StudyFolders
 from hippodrome.console.problem import Exit, Problem
+from hippodrome.console.run_state import EARLIER, STATE
 from hippodrome.local import lab, requirements
 from hippodrome.local.activity.function_log import function_log
 from hippodrome.local.activity.log import ActivityLog
@@ -30,7 +31,6 @@ from hippodrome.local.study_folder import must_hold_study
 from hippodrome.local.web import server
 from hippodrome.local.web.access import origin_of
 
-ROOT = ".hippodrome"
 LOOK = 0.5  # seconds between two looks: a signal that reaches another thread does not wake the main one
 
 
@@ -167,7 +167,7 @@ def _run_study(
 
     Raises InUse, OSError, and the errors of `Study`.
     """
-    root = data.resolve().parent / ROOT
+    root = data.resolve().parent / STATE
     state = root / data.resolve().name
     root.mkdir(parents=True, exist_ok=True)
     hold = files.Hold(root / f"{state.name}.lock")
@@ -214,7 +214,7 @@ def _remedy(error: OSError) -> str:
 def _move_aside(data: Path, state: Path, activity_log: ActivityLog) -> None:
     """End the study's servers, and move its data and state into the folder `earlier`, so that this run begins anew."""
     end_everything(state)
-    place = state.parent / "earlier" / f"{data.name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    place = state.parent / EARLIER / f"{data.name}-{time.strftime('%Y%m%d-%H%M%S')}"
     for folder, name in ((data, "data"), (state, "state")):
         if folder.exists():
             place.mkdir(parents=True, exist_ok=True)

@@ -19,6 +19,7 @@ from pathlib import Path
 import psutil
 
 from hippodrome.console.problem import Problem
+from hippodrome.console.run_state import EARLIER, STATE, mark_of, state_of
 from hippodrome.control.model import ids
 from hippodrome.control.model.project import MASTER_LIST, read_list
 from hippodrome.deployment.core.server_records import warm_servers_of
@@ -26,10 +27,6 @@ from hippodrome.deployment.operate.data_folder import SCRATCH, DataFolder
 from hippodrome.deployment.operate.eraser import Eraser
 from hippodrome.protocol.keys import participant_folder, sessions_folder
 
-STATE = ".hippodrome"
-"""Where `hippodrome run` keeps tasks, messages and unfinished recordings, beside the data folder."""
-EARLIER = "earlier"
-"""The folder in `STATE` to which `hippodrome run --fresh` moves data and their state."""
 _UNMISTAKABLE = 6  # characters from which an id cannot well be a part of other values
 
 
@@ -38,7 +35,7 @@ class FolderErasure:
 
     def __init__(self, data: Path, project: str, user: str) -> None:
         self.project, self.place = project, str(data)
-        self._folder, self._state = DataFolder(data), _state_of(data)
+        self._folder, self._state = DataFolder(data), state_of(data)
         self.eraser = Eraser(self._folder, project, user)
         self.ended: dict[str, int] = {}  # no server runs
         self.playing = 0
@@ -93,7 +90,7 @@ class FolderErasure:
 
     def _must_be_over(self) -> None:
         """Raise `Problem` if a killed `run` has left a server: it may still store what is about the participant."""
-        mark = f"hippodrome={self._state.resolve()}/tasks/"  # as in `hippodrome/local/backend/processes.py`
+        mark = mark_of(self._state, "")
         for process in psutil.process_iter():
             with contextlib.suppress(psutil.Error):
                 if any(word.startswith(mark) for word in process.cmdline()):
@@ -161,17 +158,10 @@ def mentions(data: Path, user: str) -> list[Path]:
     for folder in _folders(data):
         labels = [ids.server_label(project, user) for project in _projects(folder)]
         pattern = re.compile("|".join([*names, *labels]).encode())
-        for root in (folder, _state_of(folder)):
+        for root in (folder, state_of(folder)):
             for path in sorted(root.rglob("*")):
                 packed = path.suffix == ".gz"
                 where = os.fsencode(path.relative_to(root))
                 if path.is_file() and (pattern.search(where) or (not packed and pattern.search(path.read_bytes()))):
                     found.append(path)
     return found
-
-
-def _state_of(data: Path) -> Path:
-    """Return the folder where `run` keeps the state of this data folder. `--fresh` moves both side by side."""
-    root = data.resolve()
-    moved = root.parent.parent.name == EARLIER and root.parent.parent.parent.name == STATE
-    return root.parent / "state" if moved else root.parent / STATE / root.name

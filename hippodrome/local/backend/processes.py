@@ -13,16 +13,13 @@ from pathlib import Path
 
 import psutil
 
-
-def mark_of(state: Path, name: str) -> str:
-    """Return the mark by which a server's process is found: it stands in its command line."""
-    return f"hippodrome={state.resolve() / 'tasks' / name}"
+from hippodrome.console.run_state import mark_of
 
 
 def marked(state: Path) -> dict[str, list[psutil.Process]]:
     """Return the processes that carry the mark of this state folder, by the server's name."""
     by_mark: dict[str, list[psutil.Process]] = {}
-    ours = mark_of(state, "") + "/"
+    ours = mark_of(state, "")
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error):
             for word in process.cmdline():

@@ -22,9 +22,10 @@ from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
+from hippodrome.console.run_state import mark_of
 from hippodrome.control.config import layout
 from hippodrome.control.ports import Refused, TaskRequest
-from hippodrome.local.backend.processes import kill_group, mark_of
+from hippodrome.local.backend.processes import kill_group
 from hippodrome.local.backend.retry import Retry, start_thread
 from hippodrome.local.inherited import inherited_environment
 from hippodrome.protocol import disk, environment, handover

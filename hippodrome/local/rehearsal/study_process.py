@@ -21,6 +21,7 @@ import yaml
 
 from hippodrome import places
 from hippodrome.bots.verification import document
+from hippodrome.console.run_state import state_of
 from hippodrome.control.config.folder import read_source
 from hippodrome.control.lobby import decisions
 from hippodrome.protocol import environment, handover
@@ -266,7 +267,7 @@ def _copy_policies(project: Path, folder: Path, trial: Mapping[str, Any]) -> Non
 
 def logs_of(data: Path) -> Path:
     """Return the folder with the logs of the functions and servers of a study with this data folder."""
-    return data.resolve().parent / ".hippodrome" / data.resolve().name / "logs"
+    return state_of(data) / "logs"
 
 
 def sessions_of(data: Path, project_id: str, users: Collection[str]) -> set[str]:

@@ -21,6 +21,7 @@ import pytest
 
 from hippodrome.cli import main
 from hippodrome.console.problem import Exit
+from hippodrome.console.run_state import mark_of
 from hippodrome.control.limits.rules import ParticipantSlots
 from hippodrome.control.lobby import decisions
 from hippodrome.control.lobby.decisions import Decisions, Unmatched
@@ -32,7 +33,6 @@ from hippodrome.deployment.operate import folder_erasure
 from hippodrome.deployment.operate.data_folder import DataFolder
 from hippodrome.deployment.operate.eraser import Eraser
 from hippodrome.deployment.operate.folder_erasure import FolderErasure
-from hippodrome.local.backend.processes import mark_of
 from hippodrome.protocol.handover import Handover
 from hippodrome.protocol.keys import handover_key, session_key
 from hippodrome.protocol.session import parse
@@ -471,6 +471,6 @@ def test_a_document_that_has_changed_is_not_replaced(tmp_path: Path) -> None:
 
 
 def test_erase_and_make_run_agree_on_the_folder_of_the_lock() -> None:
-    from hippodrome.local.run import ROOT
+    from hippodrome.local.run import STATE as ROOT
 
     assert folder_erasure.STATE == ROOT

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from websockets.sync.client import connect
 
+from hippodrome.console import run_state
 from hippodrome.control.model import messages
 from hippodrome.control.ports import Address, Refused, TaskRequest
 from hippodrome.local.backend import processes, task_process
@@ -250,7 +251,7 @@ def test_servers_that_a_killed_run_has_left_are_ended(
 
 
 def marked_process(here: Here, code: str, **options: Any) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-X", processes.mark_of(here.state, NAME), "-c", code]
+    command = [sys.executable, "-X", run_state.mark_of(here.state, NAME), "-c", code]
     return subprocess.Popen(command, **({"start_new_session": True} | options))
 
 
